@@ -1,0 +1,3 @@
+"""The blocks: sensors, markers, estimators, controllers, each a Drake `LeafSystem`."""
+
+__distribution__ = "tagtrail"

@@ -1,0 +1,31 @@
+"""Planar angles and poses: wrapping, composition."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pydrake.math import RigidTransform, RollPitchYaw, atan2, cos, sin
+
+
+def wrap(angle: Any) -> Any:
+    """Returns the angle (rad) in (-pi, pi]; arrays of floats, AutoDiffXd and Expression too."""
+    if isinstance(angle, float | np.ndarray) and not (
+        isinstance(angle, np.ndarray) and angle.dtype == object
+    ):
+        wrapped = -np.remainder(-np.asarray(angle) + np.pi, 2 * np.pi) + np.pi
+        return wrapped if isinstance(angle, np.ndarray) else float(wrapped)
+    return atan2(sin(angle), cos(angle))
+
+
+def planar_pose(X_WB: RigidTransform) -> np.ndarray:
+    """Returns [x, y, theta] of a pose: its position on the ground and its heading (yaw)."""
+    R = X_WB.rotation().matrix()
+    p = X_WB.translation()
+    return np.array([p[0], p[1], np.arctan2(R[1, 0], R[0, 0])])
+
+
+def spatial_pose(pose: np.ndarray, z: float = 0.0) -> RigidTransform:
+    """Returns the `RigidTransform` of a planar pose [x, y, theta] at height z (m)."""
+    return RigidTransform(RollPitchYaw(0.0, 0.0, float(pose[2])), [pose[0], pose[1], z])

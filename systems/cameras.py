@@ -1,0 +1,258 @@
+"""Calibrated cameras: intrinsics, plumb-bob distortion, camera files, and the half-pixel rule.
+
+Pixels count from the centre of the first pixel, as OpenCV does. Drake's `CameraInfo` counts from
+the corner of the first pixel: a point at `K p` by `CameraInfo` shows at `K p - 0.5`. The half pixel
+is added in `PinholeCamera.to_drake` and nowhere else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from ruamel.yaml import YAML, YAMLError
+
+from pydrake.systems.sensors import CameraInfo
+from systems.validation import require
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeCamera:
+    """A calibrated camera with plumb-bob (Brown-Conrady) distortion, in OpenCV's convention.
+
+    Attributes:
+        width: px.
+        height: px.
+        K: (3, 3) camera matrix, px; the principal point counts from the first pixel's centre.
+        D: (5,) distortion k1, k2, p1, p2, k3, as OpenCV and ROS (`plumb_bob`) order them.
+
+    Raises:
+        ValueError: an attribute of the wrong shape, not finite, or out of range.
+    """
+
+    width: int
+    height: int
+    K: Array
+    D: Array = field(default_factory=lambda: np.zeros(5))
+
+    def __post_init__(self) -> None:
+        require(self.width > 0, "width", self.width, "greater than 0")
+        require(self.height > 0, "height", self.height, "greater than 0")
+        K = np.asarray(self.K, float)
+        D = np.asarray(self.D, float).ravel()
+        require(K.size == 9, "K", self.K, "9 numbers, row by row")
+        K = K.reshape(3, 3)
+        require(bool(np.isfinite(K).all()), "K", K.tolist(), "finite")
+        require(K[0, 0] > 0 and K[1, 1] > 0, "K", K.tolist(), "of positive focal length")
+        require(
+            K[0, 1] == 0 and K[1, 0] == 0 and (K[2] == [0, 0, 1]).all(),
+            "K",
+            K.tolist(),
+            "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+        )
+        require(D.size in (0, 4, 5), "D", D.tolist(), "4 or 5 numbers (k1, k2, p1, p2, k3)")
+        require(bool(np.isfinite(D).all()), "D", D.tolist(), "finite")
+        D = np.concatenate([D, np.zeros(5 - D.size)])
+        for array in (K, D):
+            array.setflags(write=False)
+        object.__setattr__(self, "K", K)
+        object.__setattr__(self, "D", D)
+
+    @staticmethod
+    def from_focal_length(width: int, height: int, focal_length: float) -> PinholeCamera:
+        """Returns an undistorted camera with square pixels, its principal point in the centre.
+
+        Args:
+            width: px.
+            height: px.
+            focal_length: px.
+        """
+        K = np.array(
+            [
+                [focal_length, 0.0, (width - 1) / 2],
+                [0.0, focal_length, (height - 1) / 2],
+                [0.0, 0.0, 1.0],
+            ]
+        )
+        return PinholeCamera(width, height, K)
+
+    @property
+    def distorted(self) -> bool:
+        """Whether any distortion coefficient differs from zero."""
+        return bool(self.D.any())
+
+    def project(self, p_C: Array) -> Array:
+        """Projects points.
+
+        Args:
+            p_C: (..., 3) m, in the optical frame (z forward, x right, y down), z > 0.
+
+        Returns:
+            (..., 2) px.
+        """
+        normalised = p_C[..., :2] / p_C[..., 2:]
+        if self.distorted:
+            normalised = self._distort(normalised)[0]
+        return normalised * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
+
+    def project_with_jacobian(self, p_C: Array) -> tuple[Array, Array]:
+        """Projects points and differentiates the pixels by the points.
+
+        Args:
+            p_C: (..., 3) m, in the optical frame, z > 0.
+
+        Returns:
+            (..., 2) px, and (..., 2, 3) px/m.
+        """
+        inverse_depth = 1 / p_C[..., 2:]
+        normalised = p_C[..., :2] * inverse_depth
+        focal = self.K[[0, 1], [0, 1]]
+        jacobian = np.zeros((*p_C.shape[:-1], 2, 3))
+        jacobian[..., 0, 0] = jacobian[..., 1, 1] = inverse_depth[..., 0]
+        jacobian[..., :, 2] = -normalised * inverse_depth
+        if self.distorted:
+            normalised, by_normalised = self._distort(normalised)
+            jacobian = by_normalised @ jacobian
+        return normalised * focal + self.K[:2, 2], jacobian * focal[:, None]
+
+    def undistort(self, pixels: Array) -> Array:
+        """Inverts projection and distortion.
+
+        Args:
+            pixels: (..., 2) px, in the distorted picture.
+
+        Returns:
+            (..., 2) coordinates x/z, y/z in the optical frame; NaN where the distortion model
+            cannot be inverted (a pixel beyond the model's fold).
+        """
+        target = (pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
+        if not self.distorted:
+            return target
+        # OpenCV's undistortPoints stops after five fixed-point steps; Newton's steps end at
+        # rounding error, and what does not converge is marked instead of returned.
+        guess = target.copy()
+        for _ in range(10):
+            distorted, jacobian = self._distort(guess)
+            error = target - distorted
+            a, b, c, d = (jacobian[..., i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
+            with np.errstate(all="ignore"):
+                step = np.stack(
+                    [d * error[..., 0] - b * error[..., 1], a * error[..., 1] - c * error[..., 0]],
+                    axis=-1,
+                ) / (a * d - b * c)[..., None]
+                guess = guess + step
+            if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
+                break
+        with np.errstate(all="ignore"):
+            wrong = ~(np.abs(self._distort(guess)[0] - target).max(axis=-1) < 1e-6)
+        guess[wrong] = np.nan
+        return guess
+
+    def _distort(self, normalised: Array) -> tuple[Array, Array]:
+        """Applies plumb-bob distortion to (..., 2); also returns its (..., 2, 2) derivative."""
+        k1, k2, p1, p2, k3 = self.D
+        x, y = normalised[..., 0], normalised[..., 1]
+        r2 = x * x + y * y
+        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial = slope (x dx + y dy)
+        distorted = np.stack(
+            [
+                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+                y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+            ],
+            axis=-1,
+        )
+        jacobian = np.empty((*x.shape, 2, 2))
+        jacobian[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+        jacobian[..., 1, 1] = radial + slope * y * y + 2 * p2 * x + 6 * p1 * y
+        jacobian[..., 0, 1] = jacobian[..., 1, 0] = slope * x * y + 2 * (p1 * x + p2 * y)
+        return distorted, jacobian
+
+    def to_drake(self) -> CameraInfo:
+        """Returns Drake's `CameraInfo` of the undistorted camera; the half pixel is added here."""
+        return CameraInfo(
+            self.width,
+            self.height,
+            self.K[0, 0],
+            self.K[1, 1],
+            self.K[0, 2] + 0.5,
+            self.K[1, 2] + 0.5,
+        )
+
+    def scaled(self, factor: float) -> PinholeCamera:
+        """Returns the camera whose picture is this one's, enlarged by `factor` along each side."""
+        K = self.K.copy()
+        K[:2] *= factor
+        K[:2, 2] += (factor - 1) / 2  # pixel centres: (u + 1/2) factor - 1/2
+        return PinholeCamera(round(self.width * factor), round(self.height * factor), K, self.D)
+
+    def save(self, path: Path) -> None:
+        """Writes the camera file (YAML: width, height, K, D)."""
+        content = {
+            "width": self.width,
+            "height": self.height,
+            "K": [float(k) for k in self.K.ravel()],
+            "D": [float(d) for d in self.D],
+        }
+        yaml = YAML(typ="safe", pure=True)
+        yaml.default_flow_style = None
+        yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
+        with path.open("w") as file:
+            yaml.dump(content, file)
+
+
+def load_camera(path: Path) -> PinholeCamera:
+    """Reads a camera file.
+
+    Two forms are accepted: ours (`width`, `height`, `K`, `D`) and the one that ROS's camera
+    calibration writes (`image_width`, `image_height`, `camera_matrix.data`,
+    `distortion_coefficients.data`, `distortion_model: plumb_bob`).
+
+    Raises:
+        ValueError: the file is missing, no YAML, lacks a key, has an unknown one, or a value is
+            out of range; the message names the file and the key.
+    """
+    try:
+        content = YAML(typ="safe", pure=True).load(path.read_text())
+    except OSError as error:
+        raise ValueError(f"camera file {path}: {error.strerror}") from error
+    except (YAMLError, UnicodeDecodeError) as error:
+        line = str(error).splitlines()[0]
+        raise ValueError(f"camera file {path} is not YAML: {line}") from error
+    try:
+        return camera_from_mapping(content)
+    except ValueError as error:
+        raise ValueError(f"camera file {path}: {error}") from error
+
+
+def camera_from_mapping(content: Any) -> PinholeCamera:
+    """Returns the camera that a camera file's content describes (see `load_camera`)."""
+    if not isinstance(content, dict):
+        raise ValueError("must be a mapping with the keys width, height, K, D")
+    if "image_width" in content:  # as ROS writes it
+        model = content.get("distortion_model", "plumb_bob")
+        require(model == "plumb_bob", "distortion_model", model, "plumb_bob")
+        content = {
+            "width": content["image_width"],
+            "height": content.get("image_height"),
+            "K": (content.get("camera_matrix") or {}).get("data"),
+            "D": (content.get("distortion_coefficients") or {}).get("data", []),
+        }
+    unknown = sorted(set(content) - {"width", "height", "K", "D"})
+    require(not unknown, "key", ", ".join(map(str, unknown)), "one of width, height, K, D")
+    for name in ("width", "height"):
+        value = content.get(name)
+        require(isinstance(value, int) and value > 0, name, value, "a whole number of pixels")
+    numbers = {}
+    for name in ("K", "D"):
+        try:
+            numbers[name] = np.array(content.get(name, []), float).ravel()
+        except (TypeError, ValueError):
+            raise ValueError(f"{name} is {content.get(name)!r}: must be a list of numbers") from None
+    return PinholeCamera(content["width"], content["height"], numbers["K"], numbers["D"])

@@ -1,0 +1,1 @@
+"""Controllers: pose estimate in, drive command out."""

@@ -1,0 +1,1 @@
+"""Estimators: measurements in, pose and covariance out."""

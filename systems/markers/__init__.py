@@ -1,0 +1,1 @@
+"""The marker chain: layout, boards, detector, projector, pose."""

@@ -1,0 +1,144 @@
+"""The value types that travel on abstract ports, shaped like the ROS messages that people know.
+
+Every message is immutable (its arrays are read-only), so a port, a cache and a recording may hold
+the same one, and copying it costs nothing. `stamp` is the time of measurement in seconds, not the
+time of arrival. NaN as stamp means "nothing has been measured yet".
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pydrake.math import RigidTransform
+
+Array = NDArray[np.float64]
+
+
+def whole_nanoseconds(t: float) -> float:
+    """Rounds a time in seconds to whole nanoseconds, the resolution that a recording keeps.
+
+    Sensors stamp their samples with it, so that a time read back from a recording is the same
+    float as the one that was measured.
+    """
+    return round(t * 1e9) / 1e9
+
+
+class Message:
+    """Base of all messages: freezes its arrays and is copied by reference."""
+
+    def __post_init__(self) -> None:
+        for entry in fields(self):  # type: ignore[arg-type]  # subclasses are dataclasses
+            value = getattr(self, entry.name)
+            if isinstance(value, np.ndarray) and value.flags.writeable:
+                value.setflags(write=False)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        return self
+
+    def __copy__(self) -> Self:
+        return self
+
+
+@dataclass(frozen=True, eq=False)
+class CameraImage(Message):
+    """One picture, like `sensor_msgs/Image`.
+
+    Attributes:
+        stamp: middle of the exposure, s.
+        frame_id: optical frame of the camera that took it.
+        data: uint8, (height, width) grey or (height, width, 3) RGB; (0, 0) when there is none.
+    """
+
+    stamp: float = math.nan
+    frame_id: str = ""
+    data: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 0), np.uint8))
+
+
+@dataclass(frozen=True, eq=False)
+class Detections(Message):
+    """Markers found in one picture, like `apriltag_msgs/AprilTagDetectionArray`.
+
+    Attributes:
+        stamp: time of the picture, s.
+        frame_id: optical frame of the camera.
+        family: canonical name of the marker family (see `systems.markers.family`).
+        ids: (n,) int64.
+        corners: (n, 4, 2) px, in the order top-left, top-right, bottom-right, bottom-left of the
+            upright marker, counted from the centre of the first pixel, as the (distorted) picture
+            shows them.
+        hamming: (n,) int64, bits that were corrected.
+        decision_margin: (n,) contrast of the code bits over the threshold, grey levels; larger is
+            surer.
+    """
+
+    stamp: float = math.nan
+    frame_id: str = ""
+    family: str = ""
+    ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    corners: Array = field(default_factory=lambda: np.zeros((0, 4, 2)))
+    hamming: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    decision_margin: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+    def select(self, index: NDArray[Any]) -> Detections:
+        """Returns the detections picked by a boolean mask or an index array, in that order."""
+        return Detections(
+            stamp=self.stamp,
+            frame_id=self.frame_id,
+            family=self.family,
+            ids=self.ids[index],
+            corners=self.corners[index],
+            hamming=self.hamming[index],
+            decision_margin=self.decision_margin[index],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PoseEstimate(Message):
+    """A pose with its covariance, like `geometry_msgs/PoseWithCovarianceStamped`.
+
+    Attributes:
+        stamp: time of measurement, s; NaN when there is no estimate.
+        frame_id: the parent frame, as in `X_{parent}{child}`.
+        child_frame_id: the frame whose pose it is.
+        pose: the pose of child in parent.
+        covariance: (6, 6), rotation first: a small rotation vector in the parent frame (rad), then
+            the position in the parent frame (m).
+        reprojection_rms: root mean square of the corner residuals that it leaves, px; NaN when
+            it does not come from corners.
+        ambiguous: a second pose explains the same measurements nearly as well.
+        markers: number of markers that it rests on.
+    """
+
+    stamp: float = math.nan
+    frame_id: str = ""
+    child_frame_id: str = ""
+    pose: RigidTransform = field(default_factory=RigidTransform)
+    covariance: Array = field(default_factory=lambda: np.full((6, 6), math.nan))
+    reprojection_rms: float = math.nan
+    ambiguous: bool = False
+    markers: int = 0
+
+    @property
+    def valid(self) -> bool:
+        """Whether there is an estimate at all."""
+        return not math.isnan(self.stamp)
+
+
+@dataclass(frozen=True, eq=False)
+class Health(Message):
+    """What a block dropped and why, counted since the start.
+
+    Attributes:
+        counts: reason (a snake_case word) to number of samples dropped for it.
+    """
+
+    counts: Mapping[str, int] = field(default_factory=dict)
