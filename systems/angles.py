@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
-from pydrake.math import RigidTransform, RollPitchYaw, atan2, cos, sin
+from pydrake.math import RigidTransform, RollPitchYaw
 
 
 def wrap(angle: Any) -> Any:
-    """Returns the angle (rad) in (-pi, pi]; arrays of floats, AutoDiffXd and Expression too."""
-    if isinstance(angle, float | np.ndarray) and not (
-        isinstance(angle, np.ndarray) and angle.dtype == object
-    ):
-        wrapped = -np.remainder(-np.asarray(angle) + np.pi, 2 * np.pi) + np.pi
-        return wrapped if isinstance(angle, np.ndarray) else float(wrapped)
-    return atan2(sin(angle), cos(angle))
+    """Returns the angle (rad) in (-pi, pi]; a float, or an array of floats."""
+    if isinstance(angle, np.ndarray):
+        return np.pi - np.remainder(np.pi - angle, 2 * np.pi)
+    return math.pi - (math.pi - angle) % (2 * math.pi)
 
 
 def planar_pose(X_WB: RigidTransform) -> np.ndarray:

@@ -122,37 +122,43 @@ class PinholeCamera:
         return normalised * focal + self.K[:2, 2], jacobian * focal[:, None]
 
     def undistort(self, pixels: Array) -> Array:
-        """Inverts projection and distortion.
+        """Returns the rays (..., 2) x/z, y/z of pixels (see `rays`)."""
+        return self.rays(pixels)[0]
+
+    def rays(self, pixels: Array) -> tuple[Array, Array]:
+        """Inverts projection and distortion, and says how pixels follow rays there.
 
         Args:
             pixels: (..., 2) px, in the distorted picture.
 
         Returns:
-            (..., 2) coordinates x/z, y/z in the optical frame; NaN where the distortion model
-            cannot be inverted (a pixel beyond the model's fold).
+            (..., 2) coordinates x/z, y/z in the optical frame, NaN where the distortion model
+            cannot be inverted (a pixel beyond the model's fold); and (..., 2, 2) the derivative of
+            the pixels by them, px.
         """
-        target = (pixels - self.K[:2, 2]) / self.K[[0, 1], [0, 1]]
+        focal = self.K[[0, 1], [0, 1]]
+        target = (pixels - self.K[:2, 2]) / focal
         if not self.distorted:
-            return target
+            return target, np.broadcast_to(np.diag(focal), (*target.shape, 2))
         # OpenCV's undistortPoints stops after five fixed-point steps; Newton's steps end at
         # rounding error, and what does not converge is marked instead of returned.
-        guess = target.copy()
-        for _ in range(10):
-            distorted, jacobian = self._distort(guess)
-            error = target - distorted
-            a, b, c, d = (jacobian[..., i, j] for i, j in ((0, 0), (0, 1), (1, 0), (1, 1)))
-            with np.errstate(all="ignore"):
-                step = np.stack(
-                    [d * error[..., 0] - b * error[..., 1], a * error[..., 1] - c * error[..., 0]],
-                    axis=-1,
-                ) / (a * d - b * c)[..., None]
-                guess = guess + step
-            if np.nanmax(np.abs(error), initial=0.0) < 1e-12:
-                break
+        guess = target
         with np.errstate(all="ignore"):
-            wrong = ~(np.abs(self._distort(guess)[0] - target).max(axis=-1) < 1e-6)
-        guess[wrong] = np.nan
-        return guess
+            for _ in range(10):
+                distorted, jacobian = self._distort(guess)
+                error = target - distorted
+                size = np.abs(error).max(initial=0.0)
+                if size < 1e-12:
+                    break
+                a, b = jacobian[..., 0, 0], jacobian[..., 0, 1]
+                c, d = jacobian[..., 1, 0], jacobian[..., 1, 1]
+                ex, ey = error[..., 0], error[..., 1]
+                step = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
+                guess = guess + step / (a * d - b * c)[..., None]
+            if not size < 1e-9:
+                wrong = ~(np.abs(error).max(axis=-1) < 1e-6)
+                guess = np.where(wrong[..., None], np.nan, guess)
+        return guess, jacobian * focal[:, None]
 
     def _distort(self, normalised: Array) -> tuple[Array, Array]:
         """Applies plumb-bob distortion to (..., 2); also returns its (..., 2, 2) derivative."""

@@ -12,6 +12,9 @@ import hashlib
 
 import numpy as np
 
+from pydrake.systems.framework import BasicVector, Context, LeafSystem
+from systems.validation import require
+
 
 def stream_key(seed: int, name: str) -> int:
     """Returns the 128-bit key of the stream `name` under `seed` (any integer)."""
@@ -31,3 +34,23 @@ def generator(key: int, index: int) -> np.random.Generator:
 def sample_index(t: float, rate: float) -> int:
     """Returns the index of the periodic sample taken at time `t` (s) at `rate` (Hz)."""
     return round(t * rate)
+
+
+class NoiseStream:
+    """A block's noise: its name, and its seed as a numeric parameter of the Context.
+
+    Args:
+        system: the block; call this in its constructor.
+        seed: default of the parameter, a whole number below 2^53.
+        name: name of the stream; two blocks of one name draw the same numbers.
+    """
+
+    def __init__(self, system: LeafSystem, *, seed: int, name: str) -> None:
+        require(0 <= seed < 2**53, "seed", seed, "a whole number from 0 to 2^53 - 1")
+        self._name = name
+        self._seed = int(system.DeclareNumericParameter(BasicVector([float(seed)])))
+
+    def generator(self, context: Context, index: int) -> np.random.Generator:
+        """Returns the random generator of sample `index`."""
+        seed = int(context.get_numeric_parameter(self._seed)[0])
+        return generator(stream_key(seed, self._name), index)

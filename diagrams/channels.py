@@ -1,0 +1,170 @@
+"""How a station's ports are written into a recording, and played from one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from diagrams.schema import ScenarioError
+from systems.angles import planar_pose, spatial_pose
+from systems.io.bag import BagReader
+from systems.io.playback import MessagePlayback, VectorPlayback, read_channel
+from systems.io.recorder import Channel
+from systems.io.ros_motion import (
+    command_from_ros,
+    imu_from_ros,
+    imu_to_ros,
+    planar_estimate_from_ros,
+    planar_estimate_to_ros,
+    pose_from_ros,
+    pose_to_ros,
+)
+from systems.messages import CameraImage, Detections
+
+
+@dataclass(frozen=True)
+class Signal:
+    """One port of a station and its topic: both ways.
+
+    Attributes:
+        port: name of the port.
+        topic: in the recording.
+        encode: message type, or function of value and time (s), as `Channel` takes it.
+        decode: makes the port's value of the ROS message; None takes the type's usual one.
+        model: size of the vector, or an example of the message.
+        rate: how often the port changes, Hz.
+        played: whether blocks are fed by it when the recording is played back.
+    """
+
+    port: str
+    topic: str
+    encode: str | Callable[[Any, float], Any]
+    decode: Callable[[Any], Any] | None
+    model: Any
+    rate: float
+    played: bool = True
+
+    def channel(self, rate: float) -> Channel:
+        """Returns the recorder's channel.
+
+        What is played back is looked at, at `rate` (Hz), the rate of the fastest consumer, which
+        then sees each value at the time at which it saw it first. Messages are written when their
+        stamp is new.
+        """
+        only_new = not isinstance(self.model, int)
+        return Channel(
+            port=self.port,
+            topic=self.topic,
+            encode=self.encode,
+            model=self.model,
+            rate=rate if self.played else self.rate,
+            only_new=only_new,
+        )
+
+    def player(self, reader: BagReader) -> tuple[MessagePlayback | VectorPlayback, float]:
+        """Returns the block that plays the port from a recording, and the time of its end (s).
+
+        Raises:
+            ScenarioError: the recording lacks the topic.
+        """
+        topics = reader.topics()
+        if self.topic not in topics:
+            have = ", ".join(sorted(topics))
+            raise ScenarioError(f"recording {reader.path}: lacks the topic {self.topic}; has {have}")
+        entries = read_channel(reader, self.topic, self.decode)
+        end = entries[-1].log_time * 1e-9 if entries else 0.0
+        if isinstance(self.model, int):
+            return VectorPlayback(entries=entries, size=self.model), end
+        return MessagePlayback(entries=entries, nothing=self.model), end
+
+
+def topic_of(port: str) -> str:
+    """Returns the topic of a station's port: dots become slashes."""
+    return "/" + port.replace(".", "/")
+
+
+def imu_signal(device: str, rate: float, gyro_density: float, accel_density: float) -> Signal:
+    """Returns the signal of an inertial sensor; its densities become the message's variances."""
+    return Signal(
+        port=f"{device}.sample",
+        topic=topic_of(device),
+        encode=lambda value, t: imu_to_ros(
+            value,
+            stamp=t,
+            frame_id=device.replace(".", "/"),
+            gyro_variance=gyro_density**2 * rate,
+            accel_variance=accel_density**2 * rate,
+        ),
+        decode=imu_from_ros,
+        model=6,
+        rate=rate,
+    )
+
+
+def command_signal(device: str, rate: float) -> Signal:
+    """Returns the signal of the drive command as sent."""
+    return Signal(
+        port=f"{device}.sent",
+        topic=topic_of(f"{device}.sent"),
+        encode="geometry_msgs/msg/Twist",
+        decode=command_from_ros,
+        model=2,
+        rate=rate,
+    )
+
+
+def image_signal(device: str, rate: float) -> Signal:
+    """Returns the signal of a camera's pictures."""
+    return Signal(
+        port=f"{device}.image",
+        topic=topic_of(f"{device}.image.compressed"),
+        encode="sensor_msgs/msg/CompressedImage",
+        decode=None,
+        model=CameraImage(),
+        rate=rate,
+    )
+
+
+def detections_signal(device: str, rate: float) -> Signal:
+    """Returns the signal of a camera's detections."""
+    return Signal(
+        port=f"{device}.detections",
+        topic=topic_of(f"{device}.detections"),
+        encode="apriltag_msgs/msg/AprilTagDetectionArray",
+        decode=None,
+        model=Detections(),
+        rate=rate,
+    )
+
+
+def truth_signal(robot: str) -> Signal:
+    """Returns the signal of a robot's true planar pose."""
+    return Signal(
+        port=f"truth.{robot}.pose",
+        topic=f"/truth/{robot}/pose",
+        encode=lambda value, t: pose_to_ros(spatial_pose(value), stamp=t, frame_id="map"),
+        decode=lambda message: planar_pose(pose_from_ros(message)),
+        model=3,
+        rate=50.0,
+        played=False,
+    )
+
+
+def estimate_signal(robot: str, rate: float) -> Signal:
+    """Returns the signal of a planar estimate: vector of 12, the pose and its covariance by rows."""
+    return Signal(
+        port=f"{robot}.estimate",
+        topic=f"/{robot}/estimate",
+        encode=lambda value, t: planar_estimate_to_ros(
+            value[:3], value[3:].reshape(3, 3), stamp=t, frame_id="map"
+        ),
+        decode=lambda message: np.concatenate(
+            [part.ravel() for part in planar_estimate_from_ros(message)]
+        ),
+        model=12,
+        rate=rate,
+        played=False,
+    )

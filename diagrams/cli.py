@@ -1,0 +1,182 @@
+"""The command line. Exit status: 0 fulfilled, 1 ran but failed, 2 bad input (one line says what)."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table as RichTable
+
+console = Console(highlight=False, soft_wrap=True)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command; returns the exit status."""
+    parser = _parser()
+    options = parser.parse_args(arguments)
+    logging.basicConfig(level=logging.WARNING, format="tagtrail: %(message)s")
+    try:
+        return int(options.function(options))
+    except ValueError as error:
+        print(f"tagtrail: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("tagtrail: interrupted", file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="tagtrail", description="Robots that find their way by fiducial markers, in Drake."
+    )
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+
+    def command(name: str, function: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(name, help=text, description=text)
+        sub.set_defaults(function=function)
+        return sub
+
+    command("list", _list, "list the bundled scenarios")
+
+    run = command("run", _run, "simulate one run, or play a recording back")
+    run.add_argument("scenario", help="bundled name or path of a scenario file")
+    run.add_argument("--seed", type=int, help="seed of all noise")
+    run.add_argument("--duration", type=float, metavar="S", help="end by then, seconds")
+    run.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="override a scenario's key"
+    )
+    run.add_argument("--out", type=Path, metavar="DIR", help="folder of the results [out/SCENARIO]")
+    run.add_argument(
+        "--realtime", type=float, default=0.0, metavar="RATE", help="at most this fast, 1 is real"
+    )
+    run.add_argument("--no-meshcat", action="store_true", help="neither show nor write a replay")
+    run.add_argument("--play", metavar="RECORDING", help="sensors come from this recording")
+
+    diagram = command("diagram", _diagram, "draw a scenario's block diagram")
+    diagram.add_argument("scenario")
+    diagram.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    diagram.add_argument("-o", "--out", type=Path, metavar="FILE", help="SVG [SCENARIO.svg]")
+
+    markers = command("markers", _markers, "make printable sheets of a map's markers")
+    markers.add_argument("map", help="marker map (JSON), a path or a bundled name")
+    markers.add_argument("-o", "--out", type=Path, default=Path("markers.pdf"), metavar="FILE")
+    markers.add_argument("--page", default="auto", help="A4, A3, letter or auto")
+
+    detect = command("detect", _detect, "find markers in pictures, videos, recordings")
+    detect.add_argument("source", type=Path, help="picture, folder, video or recording")
+    detect.add_argument("--family", help="marker family, 36h11 or DICT_4X4_50 for example")
+    detect.add_argument("--size", type=float, metavar="M", help="side of the black square, metres")
+    detect.add_argument("--camera", type=Path, metavar="FILE", help="camera file")
+    detect.add_argument("--out", type=Path, default=Path("out/detect"), metavar="DIR")
+    return parser
+
+
+def _list(_: argparse.Namespace) -> int:
+    from diagrams.scenario import bundled_scenarios, read_layers
+
+    table = RichTable.grid(padding=(0, 2))
+    for name, path in bundled_scenarios().items():
+        table.add_row(name, str(read_layers(path).data.get("description", "")))
+    console.print(table)
+    return 0
+
+
+def _run(options: argparse.Namespace) -> int:
+    from diagrams.run import simulate, start_meshcat
+    from diagrams.scenario import load_scenario
+
+    overrides = list(options.set)
+    for key in ("seed", "duration"):
+        if getattr(options, key) is not None:
+            overrides.append(f"{key}={getattr(options, key)}")
+    if options.play:
+        overrides.append(f"recording={options.play}")
+    scenario = load_scenario(options.scenario, overrides)
+    out = options.out or Path("out") / scenario.name
+    meshcat = None if options.no_meshcat else start_meshcat()
+    if meshcat is not None:
+        console.print(f"Meshcat: {meshcat.web_url()}")
+    with _progress() as progress:
+        run = simulate(
+            scenario, out=out, meshcat=meshcat, realtime=options.realtime, progress=progress
+        )
+    _print_report(run.report)
+    console.print(f"results: {out}")
+    if meshcat is not None:
+        console.print(f"replay:  {out / 'replay.html'} (opens in a browser)")
+    return 0 if run.succeeded else 1
+
+
+def _diagram(options: argparse.Namespace) -> int:
+    from diagrams.draw import write_diagram
+    from diagrams.scenario import load_scenario
+
+    scenario = load_scenario(options.scenario, options.set)
+    path = options.out or Path(f"{scenario.name}.svg")
+    write_diagram(scenario.build().diagram, path)
+    console.print(str(path))
+    return 0
+
+
+def _markers(options: argparse.Namespace) -> int:
+    from diagrams.schema import file_path
+    from systems.markers.layout import load_map
+    from systems.markers.sheets import write_sheets
+
+    marker_map = load_map(file_path(options.map, "maps"))
+    write_sheets(marker_map, options.out, page=options.page)
+    console.print(f"{options.out}: {len(marker_map)} markers; print at 100 %")
+    return 0
+
+
+def _detect(options: argparse.Namespace) -> int:
+    from diagrams.detect import detect
+
+    with _progress() as progress:
+        summary = detect(
+            options.source,
+            family=options.family,
+            size=options.size,
+            camera=options.camera,
+            out=options.out,
+            progress=progress,
+        )
+    table = RichTable("picture", "markers", "ids")
+    for row in summary:
+        table.add_row(*row)
+    console.print(table)
+    console.print(f"results: {options.out}")
+    return 0
+
+
+@contextmanager
+def _progress() -> Iterator[Callable[[float, float], None]]:
+    """Shows a progress bar; yields what is called with the amount done and the whole."""
+    bar = Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.1f} / {task.total:.1f}"),
+        TimeElapsedColumn(),
+        console=Console(stderr=True),
+        transient=True,
+        disable=not sys.stderr.isatty(),
+    )
+    with bar:
+        task = bar.add_task("running", total=None)
+        yield lambda done, whole: bar.update(task, completed=done, total=whole)
+
+
+def _print_report(report: dict[str, object]) -> None:
+    table = RichTable("what", "value", title=f"{report['scenario']}: {report['outcome']}")
+    rows = {key: report[key] for key in ("seed", "sim_seconds", "real_time_factor")}
+    metrics = report["metrics"]
+    assert isinstance(metrics, dict)
+    for key, value in (rows | metrics).items():
+        table.add_row(key, f"{value:.4g}" if isinstance(value, float) else str(value))
+    console.print(table)

@@ -1,0 +1,1 @@
+"""Drivers: each wires one kind of device into a station, simulated or played back."""

@@ -1,0 +1,175 @@
+"""Drivers of cameras: rendered, projected, or played back; always with their detections."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import numpy as np
+
+from diagrams.channels import detections_signal, image_signal
+from diagrams.schema import File, file_path
+from diagrams.station import RENDERER, Robot, StationBuilder
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.systems.framework import OutputPort
+from pydrake.systems.primitives import ConstantValueSource
+from systems.cameras import PinholeCamera, load_camera
+from systems.image_effects import ImageEffects
+from systems.io.ros_vision import camera_to_ros
+from systems.markers.detector import Detector, DetectorParameters, MarkerDetector
+from systems.markers.projector import MarkerProjector, ProjectorParameters, placed_markers
+from systems.messages import CameraImage, Health
+from systems.sensors.rendered_camera import RenderedCamera
+from systems.validation import require, require_non_negative, require_positive
+
+# Columns: the optical frame's axes (right, down, forward) in a frame with x forward and z up.
+R_FORWARD_OPTICAL = RotationMatrix(
+    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+)
+
+
+@dataclass
+class Camera:
+    """A calibrated camera fixed to the robot.
+
+    Ports of the station: `{robot}.{device}.image` (CameraImage; of size 0 when there are none, as
+    under projected sight), `{robot}.{device}.detections` (Detections), `{robot}.{device}.health`.
+
+    Attributes:
+        calibration: camera file (bundled, or beside the scenario).
+        rate: pictures a second, Hz.
+        latency: from the middle of the exposure to the arrival of the picture, s.
+        position: [x, y, z] of the optical centre in base_link, m.
+        rpy_deg: roll, pitch, yaw of the camera; zeros look forward, positive pitch looks down.
+        sight: `rendered` or `projected`; left out, the scenario's.
+        effects: what lens and sensor do to rendered pictures.
+        detector: how markers are found in pictures.
+        projector: how markers are found without pictures.
+    """
+
+    calibration: Annotated[str, File("cameras")]
+    rate: float = 15.0
+    latency: float = 0.0
+    position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.1])
+    rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    sight: Literal["rendered", "projected"] | None = None
+    effects: ImageEffects = field(default_factory=ImageEffects)
+    detector: DetectorParameters = field(default_factory=DetectorParameters)
+    projector: ProjectorParameters = field(default_factory=ProjectorParameters)
+
+    def __post_init__(self) -> None:
+        require_positive(rate=self.rate)
+        require_non_negative(latency=self.latency)
+        for name in ("position", "rpy_deg"):
+            value = getattr(self, name)
+            require(
+                len(value) == 3 and bool(np.isfinite(value).all()), name, value, "three numbers"
+            )
+
+    def model(self) -> PinholeCamera:
+        """Returns the calibrated camera."""
+        return load_camera(file_path(self.calibration, "cameras"))
+
+    def mounting(self) -> RigidTransform:
+        """Returns `X_BC`, the pose of the optical frame in base_link."""
+        R_BMount = RollPitchYaw(*(math.radians(a) for a in self.rpy_deg)).ToRotationMatrix()
+        return RigidTransform(R_BMount.multiply(R_FORWARD_OPTICAL), self.position)
+
+    def add(self, station: StationBuilder, robot: Robot, device: str) -> None:
+        """Wires the camera into a station."""
+        name = f"{robot.name}.{device}"
+        camera = self.model()
+        frame_id = name.replace(".", "/")
+        station.static_messages[f"/{frame_id}/camera_info"] = (
+            "sensor_msgs/msg/CameraInfo",
+            camera_to_ros(camera, stamp=0.0, frame_id=frame_id),
+        )
+        station.mountings[frame_id] = (robot.name, self.mounting())
+        images, found = image_signal(name, self.rate), detections_signal(name, self.rate)
+        image, detections = self._sources(station, robot, name, camera)
+        if image is None:
+            no_image = ConstantValueSource(AbstractValue.Make(CameraImage(frame_id=frame_id)))
+            image = station.add(no_image, f"{name}.no_image").get_output_port()
+        if detections is None:
+            detector = station.add(
+                Detector(
+                    detector=MarkerDetector(
+                        family=station.marker_map.family,
+                        parameters=self.detector,
+                        camera=camera,
+                    ),
+                    rate=self.rate,
+                ),
+                f"{name}.detector",
+            )
+            station.connect(image, detector.image_input_port())
+            detections = detector.detections_output_port()
+            station.export_output(detector.health_output_port(), f"{name}.health")
+        else:
+            health = ConstantValueSource(AbstractValue.Make(Health()))
+            station.add(health, f"{name}.no_health")
+            station.export_output(health.get_output_port(), f"{name}.health")
+        station.export_output(image, images.port, images)
+        station.export_output(detections, found.port, found)
+
+    def _sources(
+        self, station: StationBuilder, robot: Robot, name: str, camera: PinholeCamera
+    ) -> tuple[OutputPort | None, OutputPort | None]:
+        """Returns the ports of pictures and detections, None for one that there is not.
+
+        Without detections there are pictures, for the detector to look at.
+        """
+        if not station.simulated:
+            image = station.play(image_signal(name, self.rate), optional=True)
+            if image is not None:
+                return image, None
+            return None, station.play(detections_signal(name, self.rate))
+        frame_id = name.replace(".", "/")
+        if (self.sight or station.sight) == "projected":
+            markers = placed_markers(station.marker_map, station.scene_graph.world_frame_id())
+            projector = station.add(
+                MarkerProjector(
+                    camera=camera,
+                    parent_frame=robot.frame_id,
+                    X_PC=self.mounting(),
+                    markers=markers,
+                    family=station.marker_map.family,
+                    parameters=self.projector,
+                    rate=self.rate,
+                    latency=self.latency,
+                    seed=station.seed,
+                    name=name,
+                    frame_id=frame_id,
+                    transparent_frames=[robot.frame_id],
+                ),
+                f"{name}.projector",
+            )
+            station.connect(
+                station.scene_graph.get_query_output_port(), projector.query_object_input_port()
+            )
+            return None, projector.detections_output_port()
+        station.need_renderer()
+        rendered = station.add(
+            RenderedCamera(
+                camera=camera,
+                parent_frame=robot.frame_id,
+                X_PC=self.mounting(),
+                renderer=RENDERER,
+                rate=self.rate,
+                latency=self.latency,
+                effects=self.effects,
+                seed=station.seed,
+                name=name,
+                frame_id=frame_id,
+            ),
+            name,
+        )
+        station.connect(
+            station.scene_graph.get_query_output_port(), rendered.query_object_input_port()
+        )
+        station.connect(
+            robot.state.GetOutputPort("spatial_velocity"), rendered.spatial_velocity_input_port()
+        )
+        return rendered.image_output_port(), None

@@ -1,0 +1,145 @@
+"""Figures of a run. Truth and estimate differ in line style, so that colour is not needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Ellipse, Polygon
+from numpy.typing import NDArray
+
+from diagrams.metrics import NEES_BOUNDS, PoseLog, nees
+from diagrams.viewer import ellipse
+from plants.arena import Wall
+from systems.markers.layout import MarkerMap
+
+Array = NDArray[np.float64]
+
+_TRUTH = {"color": "black", "linestyle": "-", "linewidth": 1.6}
+_ESTIMATE = {"color": "tab:red", "linestyle": "--", "linewidth": 1.6}
+_BOUND = {"color": "tab:blue", "linestyle": ":", "linewidth": 1.2}
+
+
+def plot_navigation(
+    path: Path,
+    log: PoseLog,
+    *,
+    waypoints: Array,
+    radius: float,
+    walls: list[Wall],
+    markers: MarkerMap,
+) -> None:
+    """Writes the figure of a navigation run: plan view, errors with their bounds, NEES.
+
+    Args:
+        path: of the PNG.
+        log: truth and estimate.
+        waypoints: (n, 2) m.
+        radius: arrival radius, m.
+        walls: of the arena.
+        markers: of the world.
+    """
+    figure = Figure(figsize=(12.0, 6.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.05])
+    _plan(left.subplots(), log, waypoints, radius, walls, markers)
+    axes = right.subplots(4 if log.truth is not None else 3, 1, sharex=True)
+    if log.truth is None:
+        _poses(axes, log)
+    else:
+        _errors(axes, log)
+    axes[-1].set_xlabel("time [s]")
+    figure.savefig(path, dpi=110, metadata={"Software": None})
+
+
+def _plan(
+    ax: Axes,
+    log: PoseLog,
+    waypoints: Array,
+    radius: float,
+    walls: list[Wall],
+    markers: MarkerMap,
+) -> None:
+    for wall in walls:
+        X = wall.pose()
+        half = np.array([wall.length, wall.thickness]) / 2
+        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
+        outline = X.multiply(np.column_stack([corners, np.zeros(4)]).T).T[:, :2]
+        ax.add_patch(Polygon(outline, facecolor="0.8", edgecolor="0.5"))
+    for marker in markers:
+        p = marker.X_WM.translation()[:2]
+        across = marker.X_WM.rotation().matrix()[:2, 1] * marker.size / 2
+        normal = marker.X_WM.rotation().matrix()[:2, 0]
+        ax.plot(*np.transpose([p - across, p + across]), color="black", linewidth=3)
+        ax.annotate(
+            str(marker.id), p + 0.12 * normal, ha="center", va="center", fontsize=7, color="0.3"
+        )
+    for k, point in enumerate(waypoints):
+        ax.add_patch(Circle(point, radius, facecolor="none", edgecolor="tab:green"))
+        ax.annotate(f"{k + 1}", point, ha="center", va="center", color="tab:green", fontsize=9)
+    if log.truth is not None:
+        ax.plot(*log.truth[:, :2].T, label="truth", **_TRUTH)
+    known = log.estimate[log.known]
+    ax.plot(*known[:, :2].T, label="estimate", **_ESTIMATE)
+    for k in _every(log.known, 25):
+        a, b, angle = ellipse(log.covariance[k, :2, :2])
+        ax.add_patch(
+            Ellipse(
+                log.estimate[k, :2],
+                2 * a,
+                2 * b,
+                angle=np.degrees(angle),
+                facecolor="none",
+                edgecolor="tab:red",
+                linewidth=0.7,
+            )
+        )
+    ax.plot([], [], color="tab:red", linewidth=0.7, label="95 % ellipse")
+    ax.plot([], [], color="black", linewidth=3, label="marker (id)")
+    ax.plot([], [], color="tab:green", linewidth=1, label="waypoint, arrival radius")
+    ax.set_aspect("equal")
+    ax.set_xlabel("x [m]")
+    ax.set_ylabel("y [m]")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, 1.12), ncol=3, fontsize=8, frameon=False)
+
+
+def _errors(axes: Array, log: PoseLog) -> None:
+    t = log.t[log.known]
+    errors = log.errors() * [100.0, 100.0, np.degrees(1.0)]
+    covariance = log.covariance[log.known]
+    deviations = np.sqrt(np.einsum("nii->ni", covariance)) * [100.0, 100.0, np.degrees(1.0)]
+    for k, label in enumerate(("x [cm]", "y [cm]", "heading [deg]")):
+        axes[k].plot(t, errors[:, k], color="tab:red", linewidth=1.0, label="estimate - truth")
+        for sign in (1, -1):
+            axes[k].plot(t, sign * 2 * deviations[:, k], **_BOUND, label="2 sigma"[: 7 * sign])
+        axes[k].set_ylabel(f"error in {label}")
+        axes[k].grid(alpha=0.3)
+        limit = max(2.5 * float(np.quantile(deviations[:, k], 0.9)), 1.2 * np.abs(errors[:, k]).max())
+        axes[k].set_ylim(-limit, limit)
+    axes[0].legend(loc="upper right", fontsize=8, ncol=2)
+    axes[3].semilogy(t, np.maximum(nees(log.errors(), covariance), 1e-2), color="tab:red", lw=1.0)
+    for bound in NEES_BOUNDS:
+        axes[3].axhline(bound, **_BOUND)
+    axes[3].set_ylabel("NEES (3 dof)\nand 95 % bounds")
+    axes[3].grid(alpha=0.3)
+
+
+def _poses(axes: Array, log: PoseLog) -> None:
+    """What there is to see when nobody knows the truth."""
+    t, pose = log.t[log.known], log.estimate[log.known]
+    for k, label in enumerate(("x [m]", "y [m]", "heading [deg]")):
+        values = np.degrees(np.unwrap(pose[:, k])) if k == 2 else pose[:, k]
+        axes[k].plot(t, values, **_ESTIMATE)
+        axes[k].set_ylabel(f"estimated {label}")
+        axes[k].grid(alpha=0.3)
+
+
+def _every(known: NDArray[np.bool_], count: int) -> Array:
+    """Returns about `count` indices, evenly over those that are known."""
+    index = np.flatnonzero(known)
+    return index[:: max(1, len(index) // count)]
+
+

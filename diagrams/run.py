@@ -1,0 +1,143 @@
+"""Simulates a scenario once and writes the run's folder."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from diagrams.mission import FRAME_RATE, Mission
+from diagrams.scenario import Scenario, save_scenario
+from pydrake.geometry import Meshcat, MeshcatParams
+from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
+from pydrake.systems.framework import Context
+
+_MAX_STEP = 0.01  # s, of the integrator; only kinematic twins have continuous state
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run that has ended.
+
+    Attributes:
+        report: what `report.json` holds.
+        succeeded: whether the mission was fulfilled.
+        mission: what was simulated.
+        context: the diagram's context at the end.
+    """
+
+    report: dict[str, Any]
+    succeeded: bool
+    mission: Mission
+    context: Context
+
+
+def simulate(
+    scenario: Any,
+    *,
+    out: Path | None = None,
+    meshcat: Meshcat | None = None,
+    realtime: float = 0.0,
+    progress: Callable[[float, float], None] | None = None,
+) -> Run:
+    """Simulates a scenario to its end.
+
+    Args:
+        scenario: as `load_scenario` gives it.
+        out: folder of the results; None writes nothing.
+        meshcat: where it is shown; its replay is written too.
+        realtime: slows the simulation down to this many times real time; 0 is as fast as it goes.
+        progress: called with the simulated time and the duration, s.
+
+    Raises:
+        ValueError: the scenario or a file that it names is refused.
+    """
+    if out is not None:
+        _make_folder(out)
+        save_scenario(scenario, out / "scenario.yaml")
+    if meshcat is not None:
+        meshcat.StartRecording(frames_per_second=FRAME_RATE)
+    mission: Mission = scenario.build(meshcat=meshcat, out=out)
+    try:
+        outcome, context, wall = _advance(scenario, mission, realtime, progress)
+    finally:
+        if mission.recorder is not None:
+            mission.recorder.close()
+    report = {
+        "scenario": scenario.name,
+        "seed": scenario.seed,
+        "outcome": outcome,
+        "sim_seconds": context.get_time(),
+        "wall_seconds": wall,
+        "real_time_factor": context.get_time() / wall,
+        "metrics": mission.metrics(context),
+        "health": mission.health(context),
+    }
+    if mission.recorder is not None and mission.recorder.lost:
+        report["health"]["recorder"] = {"lost": mission.recorder.lost}
+    if out is not None:
+        (out / "report.json").write_text(json.dumps(_finite(report), indent=1) + "\n")
+        mission.write(context, out)
+        if meshcat is not None:
+            meshcat.PublishRecording()
+            (out / "replay.html").write_text(meshcat.StaticHtml())
+    return Run(report, mission.succeeded(outcome), mission, context)
+
+
+def start_meshcat() -> Meshcat:
+    """Returns a Meshcat server that listens on localhost only."""
+    return Meshcat(MeshcatParams(host="localhost", show_stats_plot=False))
+
+
+def _advance(
+    scenario: Scenario,
+    mission: Mission,
+    realtime: float,
+    progress: Callable[[float, float], None] | None,
+) -> tuple[str, Context, float]:
+    simulator = Simulator(mission.diagram)
+    config = SimulatorConfig(
+        integration_scheme="runge_kutta2", max_step_size=_MAX_STEP, use_error_control=False
+    )
+    ApplySimulatorConfig(config, simulator)
+    simulator.set_target_realtime_rate(realtime)
+    context = simulator.get_mutable_context()
+    end = min(scenario.duration, mission.station.end_time)
+    simulator.Initialize()
+    started = time.perf_counter()
+    outcome = None
+    step = 0.1  # s between two looks at the outcome
+    k = 0
+    while outcome is None and context.get_time() < end:
+        k += 1
+        simulator.AdvanceTo(min(k * step, end))
+        outcome = mission.outcome(context)
+        if progress is not None:
+            progress(context.get_time(), end)
+    wall = time.perf_counter() - started
+    if outcome is None:
+        outcome = "timeout" if end == scenario.duration else "played"
+    return outcome, context, wall
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--out {out}: {error.strerror}") from error
+    if not os.access(out, os.W_OK):
+        raise ValueError(f"--out {out}: cannot be written to")
+
+
+def _finite(value: Any) -> Any:
+    """Returns JSON data in which what is not finite is null."""
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

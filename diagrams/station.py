@@ -1,0 +1,410 @@
+"""The station: robots in their world as one Diagram with named ports, simulated or played back.
+
+The ports are `{robot}.{device}.{signal}`: `robot.front_camera.detections`, `robot.imu.sample`,
+`robot.drive.command`. They are the same whether the signals are simulated, come from a recording or
+from a device: drivers are chosen by name in the scenario. Only a simulated station (or a recording
+of one) adds ports under `truth.`; nothing on the robot's side reads those.
+"""
+
+from __future__ import annotations
+
+import math
+import typing
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Annotated, Any
+
+import numpy as np
+
+from diagrams.channels import Signal
+from diagrams.schema import File, ScenarioError, file_path
+from diagrams.tables import Choice, Table
+from plants.arena import ArenaParameters, add_arena
+from plants.body_state import TwinPositions
+from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import (
+    AddMultibodyPlant,
+    MultibodyPlant,
+    MultibodyPlantConfig,
+)
+from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
+from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+from systems.io.ros_motion import FrameTransform, transforms_to_ros
+from systems.markers.family import family
+from systems.markers.layout import Marker, MarkerMap, load_map
+from systems.validation import require
+
+if typing.TYPE_CHECKING:
+    from diagrams.drivers.body import DifferentialDriveBody
+    from systems.io.bag import BagReader
+
+BODIES = Table("body", {"differential_drive": "diagrams.drivers.body:DifferentialDriveBody"})
+DRIVES = Table("drive", {"wheel_servo": "diagrams.drivers.drive:WheelServo"})
+SENSORS = Table(
+    "sensor",
+    {"camera": "diagrams.drivers.camera:Camera", "imu": "diagrams.drivers.imu:InertialSensor"},
+)
+
+RENDERER = "vtk"
+
+
+@dataclass
+class TagPlacement:
+    """One marker of a scenario's own list.
+
+    Attributes:
+        id: in the family.
+        position: [x, y, z] of its centre, m.
+        facing_deg: direction that the printed face looks to, in the ground plane; 0 is along x.
+        size: side of the black square, m; 0 takes the list's.
+    """
+
+    id: int
+    position: list[float]
+    facing_deg: float
+    size: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(
+            len(self.position) == 3 and bool(np.isfinite(self.position).all()),
+            "position",
+            self.position,
+            "[x, y, z] in metres",
+        )
+
+
+@dataclass
+class TagList:
+    """Upright markers written in the scenario itself, instead of a marker map's file.
+
+    Attributes:
+        family: of all markers.
+        size: side of the black square, m.
+        tags: where they are.
+    """
+
+    family: str
+    size: float
+    tags: list[TagPlacement]
+
+    def to_map(self) -> MarkerMap:
+        """Returns the marker map."""
+        kind = family(self.family)
+        markers: dict[int, Marker] = {}
+        for tag in self.tags:
+            kind.check_id(tag.id)
+            require(tag.id not in markers, "id", tag.id, "given once")
+            R = RollPitchYaw(0.0, 0.0, math.radians(tag.facing_deg))
+            markers[tag.id] = Marker(tag.id, RigidTransform(R, tag.position), tag.size or self.size)
+        return MarkerMap(kind, self.size, markers)
+
+
+@dataclass
+class WorldParameters:
+    """What stands around the robots.
+
+    Attributes:
+        markers: a marker map's file (bundled, or beside the scenario), or the markers themselves.
+        arena: ground and walls.
+    """
+
+    markers: Annotated[str, File("maps")] | TagList
+    arena: ArenaParameters = field(default_factory=ArenaParameters)
+
+    def marker_map(self) -> MarkerMap:
+        """Returns the marker map."""
+        if isinstance(self.markers, TagList):
+            return self.markers.to_map()
+        return load_map(file_path(self.markers, "maps"))
+
+
+@dataclass
+class Start:
+    """Where a robot starts.
+
+    Attributes:
+        x: m.
+        y: m.
+        heading_deg: 0 is along x, positive to the left.
+    """
+
+    x: float = 0.0
+    y: float = 0.0
+    heading_deg: float = 0.0
+
+    def pose(self) -> np.ndarray:
+        """Returns [x (m), y (m), theta (rad)]."""
+        return np.array([self.x, self.y, math.radians(self.heading_deg)])
+
+
+@dataclass
+class RobotParameters:
+    """One robot: its body, where it starts, how it is driven, what it senses with.
+
+    Attributes:
+        body: model.
+        start: pose at the start.
+        drive: driver of the wheels.
+        sensors: drivers by device name.
+    """
+
+    body: Annotated[Choice, BODIES]
+    drive: Annotated[Choice, DRIVES]
+    start: Start = field(default_factory=Start)
+    sensors: dict[str, Annotated[Choice, SENSORS]] = field(default_factory=dict)
+
+
+@dataclass
+class Robot:
+    """A robot while its station is built.
+
+    Attributes:
+        name: prefix of its ports.
+        body: its body's driver.
+        start: [x, y, theta].
+        model: its model instance in the plant.
+        frame_id: geometry frame of its base_link.
+        state: block with the outputs pose, planar_pose, spatial_velocity, spatial_acceleration.
+        wheel_speeds: input port that takes [right, left] (rad/s).
+        twin: its kinematic twin, when there is one.
+    """
+
+    name: str
+    body: DifferentialDriveBody
+    start: np.ndarray
+    model: Any = None
+    frame_id: Any = None
+    state: Any = None
+    wheel_speeds: Any = None
+    twin: Any = None
+
+
+@dataclass
+class StationBuilder:
+    """What drivers build with.
+
+    Attributes:
+        world: what stands around the robots.
+        marker_map: the markers of the world.
+        seed: of all noise.
+        sight: `rendered` or `projected`.
+        time_step: of the multibody plant, s.
+        dynamics: `multibody` or `kinematic`.
+        player: the recording that is played back, or None when the station is simulated.
+        plant: the model of world and robots, finalized when sensors are added.
+        scene_graph: its geometry.
+        signals: the ports that go into a recording.
+        static_messages: topic to (message type, message), written once into a recording.
+        mountings: optical frame to (robot, `X_BC`), for /tf_static.
+        end_time: time of the last message that is played, s.
+    """
+
+    world: WorldParameters
+    marker_map: MarkerMap
+    seed: int = 0
+    sight: str = "rendered"
+    time_step: float = 0.005
+    dynamics: str = "multibody"
+    player: BagReader | None = None
+    builder: DiagramBuilder = field(default_factory=DiagramBuilder)
+    signals: list[Signal] = field(default_factory=list)
+    static_messages: dict[str, tuple[str, Any]] = field(default_factory=dict)
+    mountings: dict[str, tuple[str, RigidTransform]] = field(default_factory=dict)
+    end_time: float = 0.0
+    plant: MultibodyPlant = field(init=False)
+    scene_graph: SceneGraph = field(init=False)
+
+    def __post_init__(self) -> None:
+        config = MultibodyPlantConfig(
+            time_step=self.time_step,
+            discrete_contact_approximation="lagged",
+            # Sampled ports make each step an unrestricted update, which copies all abstract state.
+            use_sampled_output_ports=False,
+        )
+        if self.dynamics == "multibody":
+            self.plant, self.scene_graph = AddMultibodyPlant(config, self.builder)
+        else:
+            self.scene_graph = self.builder.AddSystem(SceneGraph())
+            self.plant = MultibodyPlant(self.time_step)
+            self.plant.RegisterAsSourceForSceneGraph(self.scene_graph)
+        self.plant.set_name("plant")
+        self.scene_graph.set_name("scene_graph")
+        add_arena(self.plant, self.world.arena, self.marker_map)
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the signals are made here, not played back."""
+        return self.player is None
+
+    def add(self, system: System, name: str) -> Any:
+        """Adds a block under a name and returns it."""
+        system.set_name(name)
+        return self.builder.AddSystem(system)
+
+    def connect(self, output: OutputPort, target: InputPort) -> None:
+        """Connects two blocks of the station."""
+        self.builder.Connect(output, target)
+
+    def export_input(self, port: InputPort, name: str) -> None:
+        """Makes a port of a block an input port of the station."""
+        self.builder.ExportInput(port, name)
+
+    def export_output(self, port: OutputPort, name: str, signal: Signal | None = None) -> None:
+        """Makes a port of a block an output port of the station, recorded if it is a signal."""
+        self.builder.ExportOutput(port, name)
+        if signal is not None:
+            self.signals.append(signal)
+
+    def play(self, signal: Signal, optional: bool = False) -> Any:
+        """Adds what plays a signal from the recording, and returns its output port.
+
+        Args:
+            signal: what is played.
+            optional: return None when the recording lacks the topic.
+
+        Raises:
+            ScenarioError: the recording lacks the topic.
+        """
+        assert self.player is not None
+        if optional and signal.topic not in self.player.topics():
+            return None
+        player, last = signal.player(self.player)
+        self.end_time = max(self.end_time, last)
+        return self.add(player, f"{signal.port}.player").value_output_port()
+
+    def need_renderer(self) -> None:
+        """Adds the renderer, once, when a camera needs it.
+
+        Raises:
+            ScenarioError: this machine cannot render.
+        """
+        if self.scene_graph.HasRenderer(RENDERER):
+            return
+        parameters = RenderEngineVtkParams()
+        try:
+            if hasattr(parameters, "backend") and not _on_mac():
+                parameters = RenderEngineVtkParams(backend="EGL")
+            self.scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(parameters))
+        except RuntimeError as error:
+            raise ScenarioError(
+                f"sight is 'rendered': the renderer does not start ({error}); install the system "
+                "packages libegl1 and libgl1-mesa-dri, or use sight=projected"
+            ) from error
+
+
+class Station(Diagram):
+    """Robots and world; see the module's docstring for the ports.
+
+    Attributes:
+        signals: the ports that go into a recording.
+        static_messages: topic to (message type, message), written once into a recording.
+        marker_map: the markers of the world.
+        plant: the model of world and robots.
+        scene_graph: its geometry.
+        robots: by name.
+        end_time: when a recording ends, s; infinite for a simulated station.
+    """
+
+    def __init__(
+        self,
+        *,
+        world: WorldParameters,
+        robots: dict[str, RobotParameters],
+        seed: int = 0,
+        sight: str = "rendered",
+        time_step: float = 0.005,
+        dynamics: str = "multibody",
+        player: BagReader | None = None,
+    ) -> None:
+        """Builds the station.
+
+        Args:
+            world: what stands around the robots.
+            robots: by name.
+            seed: of all noise.
+            sight: `rendered` or `projected`.
+            time_step: of the multibody plant, s.
+            dynamics: `multibody`, or `kinematic` for the robots' kinematic twins.
+            player: a recording to play back instead of simulating.
+
+        Raises:
+            ValueError: a file, marker or value is refused; one line.
+        """
+        super().__init__()
+        station = StationBuilder(
+            world=world,
+            marker_map=world.marker_map(),
+            seed=seed,
+            sight=sight,
+            time_step=time_step,
+            dynamics=dynamics if player is None else "kinematic",
+            player=player,
+        )
+        bodies = {
+            name: Robot(name, parameters.body.build(), parameters.start.pose())
+            for name, parameters in robots.items()
+        }
+        if station.simulated:
+            for robot in bodies.values():
+                robot.body.add_model(station.plant, robot)
+        station.plant.Finalize()
+        for name, robot in bodies.items():
+            if station.simulated:
+                robot.body.add_state(station, robot)
+            else:
+                robot.body.play_state(station, robot)
+            robots[name].drive.build().add(station, robot)
+            for device, sensor in robots[name].sensors.items():
+                sensor.build().add(station, robot, device)
+        if station.simulated and dynamics == "kinematic":
+            _show_twins(station, list(bodies.values()))
+        station.builder.ExportOutput(
+            station.scene_graph.get_query_output_port(), "scene.query_object"
+        )
+        self.signals = station.signals
+        self.static_messages = station.static_messages | _static_transforms(station.mountings)
+        self.marker_map = station.marker_map
+        self.plant = station.plant
+        self.scene_graph = station.scene_graph
+        self.robots = bodies
+        self.end_time = math.inf if station.simulated else station.end_time
+        station.builder.BuildInto(self)
+        self.set_name("station")
+
+
+def _show_twins(station: StationBuilder, robots: list[Robot]) -> None:
+    """Moves the robots' geometry with their kinematic twins."""
+    to_geometry = station.add(
+        MultibodyPositionToGeometryPose(station.plant, input_multibody_state=False), "twin_geometry"
+    )
+    source = station.plant.get_source_id()
+    station.connect(
+        to_geometry.get_output_port(), station.scene_graph.get_source_pose_port(source)
+    )
+    positions = station.add(
+        TwinPositions(plant=station.plant, models=[robot.name for robot in robots]),
+        "twin_positions",
+    )
+    for robot in robots:
+        station.connect(robot.twin.pose_output_port(), positions.GetInputPort(robot.name))
+    station.connect(positions.get_output_port(), to_geometry.get_input_port())
+
+
+def _static_transforms(
+    mountings: dict[str, tuple[str, RigidTransform]],
+) -> dict[str, tuple[str, Any]]:
+    """Returns the /tf_static message of the cameras' mountings."""
+    if not mountings:
+        return {}
+    transforms = [
+        FrameTransform(0.0, f"{robot}/base_link", frame, X_BC)
+        for frame, (robot, X_BC) in mountings.items()
+    ]
+    return {"/tf_static": ("tf2_msgs/msg/TFMessage", transforms_to_ros(transforms))}
+
+
+def _on_mac() -> bool:
+    import sys
+
+    return sys.platform == "darwin"

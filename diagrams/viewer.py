@@ -1,0 +1,162 @@
+"""What Meshcat shows beyond the geometry: the estimate, its covariance, the paths, the waypoints.
+
+The replay keeps transforms and properties, not changes of shape. So the ellipse is a disc that is
+scaled, and the paths are marks that appear one after the other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from plants.differential_drive import DifferentialDriveParameters
+from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.systems.framework import Context, InputPort, LeafSystem
+from systems.angles import spatial_pose
+
+Array = NDArray[np.float64]
+
+_ROOT = "view"
+_SIGMAS = 2.4477  # semi-axes of the planar 95 % ellipse, in standard deviations
+_STEP = 0.10  # m between two marks of a path
+_MAX_SEMI_AXIS = 5.0  # m; larger ellipses are drawn as this
+_LIFT = 0.004  # m above the ground
+
+
+def ellipse(covariance: Array) -> tuple[float, float, float]:
+    """Returns semi-axes a >= b (m) and direction of a (rad) of the 95 % ellipse of (2, 2)."""
+    values, vectors = np.linalg.eigh(covariance)
+    a, b = _SIGMAS * np.sqrt(np.maximum(values[::-1], 0.0))
+    return float(a), float(b), float(np.arctan2(vectors[1, 1], vectors[0, 1]))
+
+
+class EstimateViewer(LeafSystem):
+    """Shows the estimated pose as a ghost of the robot, with its 95 % ellipse and both paths.
+
+    .. pydrake_system::
+
+        name: EstimateViewer
+        input_ports:
+        - pose
+        - covariance
+        - truth
+
+    Args:
+        meshcat: where.
+        body: dimensions of the ghost.
+        waypoints: (n, 2) m, shown as posts with discs of the arrival radius.
+        radius: arrival radius, m.
+        rate: pictures a second, Hz.
+        show_truth: whether the port `truth` is connected.
+
+    Ports:
+        pose (input, vector of 3): [x (m), y (m), theta (rad)], the estimate.
+        covariance (input, vector of 9): of the estimate, (3, 3) row by row.
+        truth (input, vector of 3): the true pose; may be left unconnected.
+
+    A sink: it draws in publish events and influences nothing.
+    """
+
+    def __init__(
+        self,
+        *,
+        meshcat: Meshcat,
+        body: DifferentialDriveParameters,
+        waypoints: Array,
+        radius: float,
+        rate: float,
+        show_truth: bool = True,
+    ) -> None:
+        super().__init__()
+        self._meshcat = meshcat
+        self._pose_input = self.DeclareVectorInputPort("pose", 3)
+        self._covariance_input = self.DeclareVectorInputPort("covariance", 9)
+        self._truth_input = self.DeclareVectorInputPort("truth", 3)
+        self._show_truth = show_truth
+        # Where the last mark of each path was drawn: what the browser holds, not the diagram.
+        self._last: dict[str, Array] = {}
+        self._count = {"estimate": 0, "truth": 0}
+        self._draw_ghost(body)
+        self._draw_waypoints(waypoints, radius)
+        meshcat.SetObject(f"{_ROOT}/ellipse/disc", Cylinder(1.0, 0.002), Rgba(0.9, 0.2, 0.2, 0.35))
+        self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
+
+    def pose_input_port(self) -> InputPort:
+        """Returns the port of the estimated pose."""
+        return self._pose_input
+
+    def covariance_input_port(self) -> InputPort:
+        """Returns the port of the covariance."""
+        return self._covariance_input
+
+    def truth_input_port(self) -> InputPort:
+        """Returns the port of the true pose."""
+        return self._truth_input
+
+    def _draw_ghost(self, body: DifferentialDriveParameters) -> None:
+        ghost = Rgba(0.9, 0.2, 0.2, 0.35)
+        middle = body.clearance + body.height / 2
+        chassis = Box(body.length, body.width, body.height)
+        self._meshcat.SetObject(f"{_ROOT}/estimate/chassis", chassis, ghost)
+        self._meshcat.SetTransform(
+            f"{_ROOT}/estimate/chassis", RigidTransform([0.0, 0.0, middle])
+        )
+        for side, y in (("right", -1), ("left", 1)):
+            name = f"{_ROOT}/estimate/{side}_wheel"
+            self._meshcat.SetObject(name, Cylinder(body.wheel_radius, body.wheel_width), ghost)
+            X_BWheel = RigidTransform(
+                RollPitchYaw(np.pi / 2, 0.0, 0.0), [0.0, y * body.base / 2, body.wheel_radius]
+            )
+            self._meshcat.SetTransform(name, X_BWheel)
+
+    def _draw_waypoints(self, waypoints: Array, radius: float) -> None:
+        for k, (x, y) in enumerate(waypoints):
+            name = f"{_ROOT}/waypoints/{k}"
+            self._meshcat.SetTransform(name, RigidTransform([x, y, 0.0]))
+            self._meshcat.SetObject(
+                f"{name}/area", Cylinder(radius, 0.002), Rgba(0.2, 0.6, 0.3, 0.25)
+            )
+            self._meshcat.SetObject(
+                f"{name}/post", Cylinder(0.01, 0.3), Rgba(0.2, 0.6, 0.3, 0.9)
+            )
+            self._meshcat.SetTransform(f"{name}/post", RigidTransform([0.0, 0.0, 0.15]))
+
+    def _draw(self, context: Context) -> None:
+        t = context.get_time()
+        pose = self._pose_input.Eval(context)
+        covariance = self._covariance_input.Eval(context).reshape(3, 3)
+        drawable = bool(np.isfinite(pose).all() and np.isfinite(covariance).all())
+        known = drawable and covariance[0, 0] < _MAX_SEMI_AXIS**2
+        for name in ("estimate", "ellipse"):
+            self._meshcat.SetProperty(f"{_ROOT}/{name}", "visible", known, t)
+        if known:
+            a, b, angle = ellipse(covariance[:2, :2])
+            self._meshcat.SetTransform(f"{_ROOT}/estimate", spatial_pose(pose), t)
+            at = spatial_pose(np.array([pose[0], pose[1], angle]), _LIFT)
+            self._meshcat.SetTransform(f"{_ROOT}/ellipse", at, t)
+            size = [min(max(s, 1e-3), _MAX_SEMI_AXIS) for s in (a, b)]
+            self._meshcat.SetProperty(f"{_ROOT}/ellipse/disc", "scale", [*size, 1.0], t)
+            self._mark("estimate", pose, t)
+        if self._show_truth:
+            truth = self._truth_input.Eval(context)
+            if np.isfinite(truth).all():
+                self._mark("truth", truth, t)
+
+    def _mark(self, path: str, pose: Array, t: float) -> None:
+        """Adds a mark to a path when the robot has come far enough."""
+        last = self._last.get(path)
+        if last is not None and np.hypot(*(pose[:2] - last)) < _STEP:
+            return
+        self._last[path] = pose[:2].copy()
+        name = f"{_ROOT}/path of the {path}/{self._count[path]}"
+        self._count[path] += 1
+        # Told apart without colour: the truth leaves balls, the estimate flat squares.
+        if path == "truth":
+            self._meshcat.SetObject(name, Sphere(0.012), Rgba(0.1, 0.1, 0.1, 1.0))
+        else:
+            self._meshcat.SetObject(name, Box(0.04, 0.04, 0.003), Rgba(0.9, 0.2, 0.2, 1.0))
+        self._meshcat.SetTransform(name, spatial_pose(pose, 0.008))
+        if t > 0:
+            self._meshcat.SetProperty(name, "visible", False, 0.0)
+        self._meshcat.SetProperty(name, "visible", True, t)

@@ -1,0 +1,118 @@
+"""The last block before the wheels: samples the drive command and keeps it within its limits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+from systems.health import Counts
+from systems.validation import require_positive
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class WheelDriveParameters:
+    """Limits of the drive.
+
+    Attributes:
+        rate: how often the command is taken, Hz.
+        max_speed: m/s.
+        max_turn_rate: rad/s.
+        max_acceleration: m/s^2.
+        max_turn_acceleration: rad/s^2.
+    """
+
+    rate: float = 50.0
+    max_speed: float = 0.5
+    max_turn_rate: float = 3.0
+    max_acceleration: float = 1.0
+    max_turn_acceleration: float = 10.0
+
+    def __post_init__(self) -> None:
+        require_positive(**vars(self))
+
+
+class WheelDrive(LeafSystem):
+    """Samples the command, limits speed and acceleration, and tells the wheels.
+
+    .. pydrake_system::
+
+        name: WheelDrive
+        input_ports:
+        - command
+        output_ports:
+        - sent
+        - wheel_speeds
+        - health
+
+    Args:
+        to_wheel_speeds: inverse kinematics, [v, omega] to [right, left] (rad/s).
+        parameters: limits and rate.
+
+    Ports:
+        command (input, vector of 2): [v (m/s), omega (rad/s)]. A value that is not finite is
+            dropped and counted, and the drive slows down to a stop.
+        sent (output, vector of 2): the command after the limits, as the wheels get it and as the
+            robot knows it, held between samples at `rate`.
+        wheel_speeds (output, vector of 2): [right, left] (rad/s) of `sent`.
+        health (output, Health): commands that were not finite.
+    """
+
+    def __init__(
+        self,
+        *,
+        to_wheel_speeds: Callable[[Array], list[float]],
+        parameters: WheelDriveParameters | None = None,
+    ) -> None:
+        super().__init__()
+        p = parameters or WheelDriveParameters()
+        self._limit = np.array([p.max_speed, p.max_turn_rate])
+        self._change = np.array([p.max_acceleration, p.max_turn_acceleration]) / p.rate
+        self._to_wheel_speeds = to_wheel_speeds
+        self._command_input = self.DeclareVectorInputPort("command", 2)
+        self._sent = self.DeclareDiscreteState(2)
+        self._counts = Counts(self, "bad_command")
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / p.rate, 0.0, self._sample)
+        self._sent_output = self.DeclareStateOutputPort("sent", self._sent)
+        ticket = {self.discrete_state_ticket(self._sent)}
+        self._wheel_speeds_output = self.DeclareVectorOutputPort(
+            "wheel_speeds", 2, self._calc_wheel_speeds, ticket
+        )
+
+    def command_input_port(self) -> InputPort:
+        """Returns the port of the command."""
+        return self._command_input
+
+    def sent_output_port(self) -> OutputPort:
+        """Returns the port of the command as sent."""
+        return self._sent_output
+
+    def wheel_speeds_output_port(self) -> OutputPort:
+        """Returns the port of the wheel speeds."""
+        return self._wheel_speeds_output
+
+    def health_output_port(self) -> OutputPort:
+        """Returns the port of the counts."""
+        return self._counts.output_port
+
+    def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
+        command = self._command_input.Eval(context)
+        if not np.isfinite(command).all():
+            self._counts.add(context, discrete_state, bad_command=1)
+            command = np.zeros(2)
+        sent = context.get_discrete_state(self._sent).get_value()
+        wanted = np.clip(command, -self._limit, self._limit)
+        discrete_state.set_value(
+            self._sent, sent + np.clip(wanted - sent, -self._change, self._change)
+        )
+
+    def _calc_wheel_speeds(self, context: Context, output: Any) -> None:
+        output.SetFromVector(
+            self._to_wheel_speeds(context.get_discrete_state(self._sent).get_value())
+        )

@@ -1,0 +1,125 @@
+"""What a real camera does to an ideal picture: lens, exposure, noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.cameras import PinholeCamera
+from systems.validation import require, require_non_negative, require_positive
+
+Image = NDArray[np.uint8]
+
+
+@dataclass
+class ImageEffects:
+    """Effects, in the order in which light meets them.
+
+    Attributes:
+        supersampling: the ideal picture is formed this many times larger along each side and
+            reduced by area: anti-aliasing, at the square of the cost.
+        exposure: time that the shutter is open, s; blurs motion when exposure_samples > 1.
+        exposure_samples: pictures averaged over the exposure; 1 does without motion blur.
+        focus_blur: standard deviation of the lens' blur, px.
+        gain: brightness factor; what exceeds white is clipped.
+        shot_noise: standard deviation at white, grey levels; falls with the root of brightness.
+        read_noise: standard deviation at every brightness, grey levels.
+        grey: one channel instead of three.
+    """
+
+    supersampling: int = 1
+    exposure: float = 0.01
+    exposure_samples: int = 1
+    focus_blur: float = 0.0
+    gain: float = 1.0
+    shot_noise: float = 0.0
+    read_noise: float = 0.0
+    grey: bool = True
+
+    def __post_init__(self) -> None:
+        for name in ("supersampling", "exposure_samples"):
+            value = getattr(self, name)
+            require(1 <= value <= 64, name, value, "a whole number from 1 to 64")
+        require_positive(gain=self.gain)
+        require_non_negative(
+            exposure=self.exposure,
+            focus_blur=self.focus_blur,
+            shot_noise=self.shot_noise,
+            read_noise=self.read_noise,
+        )
+
+
+class Lens:
+    """Forms the pictures of a distorted camera out of those of an ideal one.
+
+    Args:
+        camera: the camera whose pictures are wanted.
+        supersampling: factor by which the ideal picture is larger along each side.
+
+    Attributes:
+        ideal: the undistorted camera to render with; it sees all that `camera` sees.
+
+    Raises:
+        ValueError: the distortion cannot be inverted everywhere in the picture.
+    """
+
+    def __init__(self, camera: PinholeCamera, supersampling: int = 1) -> None:
+        self._supersampling = supersampling
+        large = camera.scaled(supersampling)
+        if not camera.distorted:
+            self.ideal = large
+            self._maps = None
+            return
+        v, u = np.mgrid[0 : large.height, 0 : large.width]
+        rays = large.undistort(np.stack([u, v], axis=-1).astype(float))
+        require(
+            bool(np.isfinite(rays).all()),
+            "D",
+            camera.D.tolist(),
+            "invertible over the whole picture",
+        )
+        pixels = rays * large.K[[0, 1], [0, 1]]
+        low = np.floor(pixels.min(axis=(0, 1))) - 1
+        high = np.ceil(pixels.max(axis=(0, 1))) + 1
+        K = large.K.copy()
+        K[:2, 2] = -low
+        width, height = (int(n) + 1 for n in high - low)
+        self.ideal = PinholeCamera(width, height, K)
+        self._maps = cv2.convertMaps(
+            *np.moveaxis((pixels - low).astype(np.float32), -1, 0), cv2.CV_16SC2
+        )
+
+    def __call__(self, ideal: Image) -> Image:
+        """Returns the camera's picture of what the ideal camera saw."""
+        image = ideal
+        if self._maps is not None:
+            image = cv2.remap(image, *self._maps, cv2.INTER_LINEAR)
+        if self._supersampling > 1:
+            size = (image.shape[1] // self._supersampling, image.shape[0] // self._supersampling)
+            image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        return image
+
+
+def expose(image: Image, effects: ImageEffects, rng: np.random.Generator) -> Image:
+    """Applies blur, gain, noise and rounding to a picture.
+
+    Args:
+        image: uint8 (height, width) or (height, width, 3).
+        effects: what to apply.
+        rng: source of the noise.
+
+    Returns:
+        uint8 of the same shape.
+    """
+    if effects.focus_blur > 0:
+        image = cv2.GaussianBlur(image, (0, 0), effects.focus_blur)
+    if effects.gain == 1 and effects.shot_noise == 0 and effects.read_noise == 0:
+        return image
+    light = image.astype(np.float32) * np.float32(effects.gain)
+    if effects.shot_noise > 0 or effects.read_noise > 0:
+        variance = effects.read_noise**2 + effects.shot_noise**2 / 255 * light
+        light += np.sqrt(variance) * rng.standard_normal(light.shape, np.float32)
+    return np.rint(light).clip(0, 255).astype(np.uint8)

@@ -1,0 +1,195 @@
+"""Records a diagram's ports into a rosbag2 folder."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
+
+from systems.io.bag import BagWriter
+from systems.io.ros_messages import Encoder, encoder
+from systems.validation import require, require_non_negative, require_positive
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Channel:
+    """One port that is recorded.
+
+    Attributes:
+        port: name of the input port.
+        topic: where it is published in the recording.
+        encode: a message type, such as `sensor_msgs/msg/Imu`, for its usual conversion, or a
+            function of the port's value and the time (s) that returns a ROS message.
+        model: what the port carries: a number n for a vector of n, else an example of the message
+            (`Detections()`, `RigidTransform()`).
+        rate: how often the port is looked at, Hz.
+        offset: time of the first look, s.
+        only_new: record only what has another stamp than the last one recorded; for messages with
+            a stamp.
+
+    Raises:
+        ValueError: an attribute out of range, or a message type without a usual conversion.
+    """
+
+    port: str
+    topic: str
+    encode: str | Encoder
+    model: Any
+    rate: float
+    offset: float = 0.0
+    only_new: bool = False
+
+    def __post_init__(self) -> None:
+        require(bool(self.port), "port", self.port, "a name")
+        require(self.topic.startswith("/"), "topic", self.topic, "absolute, such as /imu/data")
+        require_positive(rate=self.rate)
+        require_non_negative(offset=self.offset)
+        if self.is_vector:
+            require(self.model > 0, "model", self.model, "a vector of at least one element")
+        if self.only_new:
+            require(hasattr(self.model, "stamp"), "model", self.model, "a message with a stamp")
+        if isinstance(self.encode, str):
+            encoder(self.encode)
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether the port carries a vector."""
+        return isinstance(self.model, int)
+
+
+class Recorder(LeafSystem):
+    """Writes what its ports carry into a recording, each at a rate of its own.
+
+    .. pydrake_system::
+
+        name: Recorder
+        input_ports:
+        - port of the first channel
+        - ...
+        - port of the last channel
+
+    Args:
+        channels: the ports, at least one.
+        writer: the recording. Whoever makes it closes it, or calls `close`.
+        static: topic to (message type, message), written once when the simulation is initialised,
+            and kept for late subscribers: /tf_static, camera_info.
+
+    Ports:
+        {channel.port} (input, as channel.model says): what is recorded, with the time of the
+            Context as log time. Messages that say nothing yet (a stamp of NaN) are left out.
+
+    It looks in discrete updates, though it has no state, because it is to see what an estimator
+    sees that updates at the same moment: messages that arrive then (Drake does unrestricted
+    updates first), and of discrete states the values from before. A publish event would miss the
+    former, and what is played back would come a step late. So a recording holds for each time what
+    was in force then; `systems.io.playback` plays it so. A block that looks in unrestricted updates
+    is the exception: played back, a message that arrives at the same moment reaches it a step
+    earlier.
+
+    The file is outside of the Context: a recorder has no influence on the simulation. What cannot
+    be written, for want of space or because it does not fit its message, is counted in `lost`; the
+    first of each kind is logged in one line, and the simulation goes on.
+
+    Raises:
+        ValueError: no channel, or two of one port.
+    """
+
+    def __init__(
+        self,
+        *,
+        channels: Sequence[Channel],
+        writer: BagWriter,
+        static: Mapping[str, tuple[str, Any]] | None = None,
+    ) -> None:
+        super().__init__()
+        require(len(channels) > 0, "channels", list(channels), "at least one")
+        names = [channel.port for channel in channels]
+        require(len(set(names)) == len(names), "channels", names, "of different port names")
+        self._writer = writer
+        self._static = dict(static or {})
+        self._refused = 0
+        self._warned: set[str] = set()
+        # What the file holds already is the file's state, not the diagram's.
+        self._written_stamps: dict[str, float] = {}
+        groups: dict[tuple[float, float], list[tuple[Channel, InputPort, Encoder]]] = {}
+        for channel in channels:
+            port = (
+                self.DeclareVectorInputPort(channel.port, channel.model)
+                if channel.is_vector
+                else self.DeclareAbstractInputPort(channel.port, AbstractValue.Make(channel.model))
+            )
+            encode = encoder(channel.encode) if isinstance(channel.encode, str) else channel.encode
+            groups.setdefault((channel.rate, channel.offset), []).append((channel, port, encode))
+        self.DeclareInitializationPublishEvent(self._record_static)
+        for (rate, offset), group in groups.items():
+            self.DeclarePeriodicDiscreteUpdateEvent(
+                1.0 / rate, offset, partial(self._record, group)
+            )
+
+    @property
+    def lost(self) -> int:
+        """Messages that were to be recorded and are not in the file."""
+        return self._refused + self._writer.lost
+
+    def close(self) -> None:
+        """Writes what is outstanding and closes the recording; a full disk is logged."""
+        try:
+            self._writer.close()
+        except OSError as error:
+            self._warn("close", f"recording stopped: {error}")
+
+    def _record_static(self, context: Context) -> None:
+        # Once, though a simulation may be initialised again.
+        static, self._static = self._static, {}
+        for topic, (msgtype, message) in static.items():
+            self._write(topic, msgtype, message, context.get_time(), latched=True)
+
+    def _record(
+        self,
+        group: list[tuple[Channel, InputPort, Encoder]],
+        context: Context,
+        discrete_state: DiscreteValues,  # noqa: ARG002 - Drake's signature; there is no state
+    ) -> None:
+        t = context.get_time()
+        for channel, port, encode in group:
+            value = port.Eval(context)
+            stamp = getattr(value, "stamp", t)
+            if math.isnan(stamp):
+                continue
+            if channel.only_new:
+                if stamp == self._written_stamps.get(channel.port):
+                    continue
+                self._written_stamps[channel.port] = stamp
+            try:
+                message = encode(value, t)
+            except ValueError as error:
+                self._refuse(channel.topic, error)
+                continue
+            self._write(channel.topic, message.__msgtype__, message, t)
+
+    def _write(
+        self, topic: str, msgtype: str, message: Any, t: float, latched: bool = False
+    ) -> None:
+        try:
+            self._writer.write(topic, msgtype, message, t, latched=latched)
+        except ValueError as error:
+            self._refuse(topic, error)
+        except OSError as error:
+            self._warn("disk", f"recording at {t:.3f} s of the simulation: {error}; it goes on")
+
+    def _refuse(self, topic: str, error: ValueError) -> None:
+        self._refused += 1
+        self._warn(topic, f"not recorded: {topic}: {error}")
+
+    def _warn(self, kind: str, text: str) -> None:
+        if kind not in self._warned:
+            self._warned.add(kind)
+            _log.warning(text)

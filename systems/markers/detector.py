@@ -1,0 +1,311 @@
+"""Markers in a picture: an engine proposes, refined corners and the code's cells decide.
+
+OpenCV's ArUco engine serves the `cv2.aruco` dictionaries, AprilTag 3 its own families. Either way
+the corners are refined (`systems.markers.corner_refinement`) and the cells read again
+(`systems.markers.code_reading`), so corners, hamming distance and decision margin mean the same for
+every family, and what an engine takes for a marker in letters, gravel or checkerboards is found
+out: its border is not black all round, or its margin not white.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import cv2
+import numpy as np
+from apriltag import apriltag
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+
+from systems.cameras import PinholeCamera
+from systems.health import Counts
+from systems.markers.code_reading import CodeReader
+from systems.markers.corner_refinement import refine_corners
+from systems.markers.family import Family
+from systems.markers.family import family as family_by_name
+from systems.memo import Memo
+from systems.messages import CameraImage, Detections
+from systems.validation import require, require_non_negative, require_positive
+
+Array = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+Found = tuple[NDArray[np.int64], Array]  # ids (n,) and corners (n, 4, 2) px, in the design's order
+
+
+@dataclass
+class DetectorParameters:
+    """What counts as a marker.
+
+    Attributes:
+        hamming_max: code cells that may be wrong. Never more than half of what the family could
+            correct: the other half is what tells markers from clutter.
+        rim_errors_max: share of the cells of border and margin that may be on the wrong side of
+            the threshold (hidden, in glare, beside a narrow margin).
+        min_decision_margin: grey levels; AprilTag 3's scale, where a sharp marker printed with
+            contrast c has 0.6 c to 1.1 c.
+        min_side: length of the shortest side, px.
+        refine: refine the corners to sub-pixels.
+        decimate: AprilTag 3 looks for squares in the picture reduced by this, 1 or greater; faster,
+            and blind to small markers.
+        blur: standard deviation of the blur with which AprilTag 3 looks for squares, px; for noisy
+            pictures.
+    """
+
+    hamming_max: int = 1
+    rim_errors_max: float = 1 / 16
+    min_decision_margin: float = 10.0
+    min_side: float = 8.0
+    refine: bool = True
+    decimate: float = 1.0
+    blur: float = 0.0
+
+    def __post_init__(self) -> None:
+        require_non_negative(
+            hamming_max=self.hamming_max,
+            rim_errors_max=self.rim_errors_max,
+            min_decision_margin=self.min_decision_margin,
+            min_side=self.min_side,
+            blur=self.blur,
+        )
+        require(self.hamming_max == int(self.hamming_max), "hamming_max", self.hamming_max, "whole")
+        require(self.rim_errors_max < 0.5, "rim_errors_max", self.rim_errors_max, "less than 0.5")
+        require(
+            math.isfinite(self.decimate) and self.decimate >= 1,
+            "decimate",
+            self.decimate,
+            "1 or greater",
+        )
+
+
+class MarkerDetector:
+    """Finds the markers of one family in pictures.
+
+    Markers with one id in two places are both kept. Make one detector and keep it: it holds the
+    engine's tables.
+
+    Args:
+        family: the family or its name.
+        parameters: what counts as a marker.
+        camera: the calibrated camera. Needed only where the lens distorts: edges are then fitted
+            as the curves that they are. Corners are those of the picture as it is in any case.
+
+    Raises:
+        ValueError: unknown family.
+    """
+
+    def __init__(
+        self,
+        *,
+        family: Family | str,
+        parameters: DetectorParameters | None = None,
+        camera: PinholeCamera | None = None,
+    ) -> None:
+        self.family = family_by_name(family) if isinstance(family, str) else family
+        self.parameters = parameters or DetectorParameters()
+        self.camera = camera
+        self._hamming_max = min(self.parameters.hamming_max, self.family.max_correction // 2)
+        engine = _AprilTagEngine if self.family.is_apriltag else _ArucoEngine
+        self._engine: _Engine = engine(self.family, self.parameters, self._hamming_max)
+        self._reader = CodeReader(family=self.family)
+
+    def detect(self, image: Grey, stamp: float = math.nan, frame_id: str = "") -> Detections:
+        """Finds the markers in a picture.
+
+        Args:
+            image: uint8, (height, width) grey or (height, width, 3) RGB.
+            stamp: time of the picture, s.
+            frame_id: optical frame of the camera.
+
+        Returns:
+            The markers, in the engine's order. All numbers are finite.
+
+        Raises:
+            ValueError: not such an image, or one without pixels.
+        """
+        if not is_picture(image):
+            what = f"{getattr(image, 'dtype', type(image).__name__)} {np.shape(image)}"
+            raise ValueError(
+                f"image is {what}: must be uint8, (height, width) or (height, width, 3)"
+            )
+        grey = np.ascontiguousarray(image)
+        if grey.ndim == 3:
+            grey = cv2.cvtColor(grey, cv2.COLOR_RGB2GRAY)
+        ids, corners = self._find(grey)
+        if self.parameters.refine:
+            corners = refine_corners(grey, corners, self.family.cells, self.camera)
+        reading = self._reader.read(grey, ids, corners, self.camera)
+        sides = np.hypot(*(corners - corners[:, [1, 2, 3, 0]]).T)
+        good = (
+            (reading.hamming <= self._hamming_max)
+            & (reading.rim_errors <= self.parameters.rim_errors_max * self._reader.rim_cells)
+            & (reading.decision_margin >= self.parameters.min_decision_margin)
+            & (sides.min(axis=0) >= self.parameters.min_side)
+        )
+        found = Detections(
+            stamp=stamp,
+            frame_id=frame_id,
+            family=self.family.name,
+            ids=ids,
+            corners=corners,
+            hamming=reading.hamming,
+            decision_margin=reading.decision_margin,
+        )
+        if not good.all():
+            found = found.select(good)
+        return _without_doubles(found)
+
+    def _find(self, grey: Grey) -> Found:
+        if min(grey.shape) < self.family.cells + 2:  # no room for a marker of one pixel a cell
+            return np.zeros(0, np.int64), np.zeros((0, 4, 2))
+        return self._engine.find(grey)
+
+
+def is_picture(image: Any) -> bool:
+    """Whether it is a uint8 array of (height, width) or (height, width, 3) with pixels in it."""
+    return (
+        isinstance(image, np.ndarray)
+        and image.dtype == np.uint8
+        and image.size > 0
+        and (image.ndim == 2 or (image.ndim == 3 and image.shape[2] == 3))
+    )
+
+
+class _Engine(Protocol):
+    def find(self, grey: Grey) -> Found: ...
+
+
+class _ArucoEngine:
+    def __init__(self, family: Family, parameters: DetectorParameters, hamming_max: int) -> None:  # noqa: ARG002 - as the other engine
+        settings = cv2.aruco.DetectorParameters()
+        settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
+        # Bits read from rough corners may be wrong: those that count are read again.
+        settings.errorCorrectionRate = 1.0
+        self._detector = cv2.aruco.ArucoDetector(family.opencv_dictionary(), settings)
+
+    def find(self, grey: Grey) -> Found:
+        corners, ids, _ = self._detector.detectMarkers(grey)
+        if ids is None:
+            return np.zeros(0, np.int64), np.zeros((0, 4, 2))
+        return ids.ravel().astype(np.int64), np.concatenate(corners).astype(float)
+
+
+class _AprilTagEngine:
+    def __init__(self, family: Family, parameters: DetectorParameters, hamming_max: int) -> None:
+        self._detector = apriltag(
+            family.name,
+            threads=1,
+            maxhamming=min(hamming_max, 3),  # more takes the engine gigabytes of tables
+            decimate=parameters.decimate,
+            blur=parameters.blur,
+        )
+
+    def find(self, grey: Grey) -> Found:
+        found = self._detector.detect(grey)
+        ids = np.array([tag["id"] for tag in found], np.int64)
+        corners = np.array([tag["lb-rb-rt-lt"] for tag in found], float).reshape(-1, 4, 2)
+        # From the first pixel's corner to its centre; from the bottom-left to the top-left first.
+        return ids, corners[:, ::-1] - 0.5
+
+
+def _without_doubles(found: Detections) -> Detections:
+    """Drops a marker that overlaps a surer one of the same id: one marker, seen twice."""
+    if len(set(found.ids.tolist())) == len(found):
+        return found
+    keep: list[int] = []
+    for i in np.lexsort((-found.decision_margin, found.hamming)):
+        outline = found.corners[i].astype(np.float32)
+        centre = outline.mean(axis=0)
+        for j in keep:
+            other = found.corners[j].astype(np.float32)
+            if found.ids[i] == found.ids[j] and (
+                cv2.pointPolygonTest(other, centre.tolist(), False) >= 0
+                or cv2.pointPolygonTest(outline, other.mean(axis=0).tolist(), False) >= 0
+            ):
+                break
+        else:
+            keep.append(int(i))
+    return found.select(np.sort(keep))
+
+
+class Detector(LeafSystem):
+    """Finds the markers of one family in the pictures of a camera.
+
+    .. pydrake_system::
+
+        name: Detector
+        input_ports:
+        - image
+        output_ports:
+        - detections
+        - health
+
+    Args:
+        detector: the algorithm with its family and lens.
+        rate: how often new pictures are looked at to count bad ones, Hz; at least the camera's.
+
+    Ports:
+        image (input, CameraImage): grey or RGB.
+        detections (output, Detections): the markers in that picture, in its own pixels, with its
+            stamp; computed once for each picture. Without a picture yet, or with a bad one, there
+            are none and the stamp is NaN.
+        health (output, Health): `bad_image` counts pictures that are no uint8 image of (height,
+            width) or (height, width, 3).
+
+    Source: Garrido-Jurado et al., "Automatic generation and detection of highly reliable fiducial
+    markers under occlusion", Pattern Recognition 2014 (the engine is OpenCV's), and Wang and Olson,
+    "AprilTag 2: efficient and robust fiducial detection", IROS 2016 (the engine is AprilTag 3). We
+    differ in what comes after the engine: sub-pixel corners and a second look at the cells, alike
+    for both.
+
+    Raises:
+        ValueError: rate out of range.
+    """
+
+    def __init__(self, *, detector: MarkerDetector, rate: float) -> None:
+        super().__init__()
+        require_positive(rate=rate)
+        self._detector = detector
+        self._memo = Memo(self, "detections")
+        self._image_input = self.DeclareAbstractInputPort(
+            "image", AbstractValue.Make(CameraImage())
+        )
+        self._detections_output = self.DeclareAbstractOutputPort(
+            "detections",
+            lambda: AbstractValue.Make(Detections()),
+            self._calc_detections,
+            {self._image_input.ticket()},
+        )
+        self._last_stamp = self.DeclareDiscreteState([math.nan])
+        self._counts = Counts(self, "bad_image")
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._count)
+
+    def image_input_port(self) -> InputPort:
+        """Returns the port of the pictures."""
+        return self._image_input
+
+    def detections_output_port(self) -> OutputPort:
+        """Returns the port of the markers found."""
+        return self._detections_output
+
+    def health_output_port(self) -> OutputPort:
+        """Returns the port of what was dropped."""
+        return self._counts.output_port
+
+    def _calc_detections(self, context: Context, output: AbstractValue) -> None:
+        image = self._image_input.Eval(context)
+        output.set_value(self._memo(context, self._detect, image))
+
+    def _detect(self, image: CameraImage) -> Detections:
+        if math.isfinite(image.stamp) and is_picture(image.data):
+            return self._detector.detect(image.data, image.stamp, image.frame_id)
+        return Detections(frame_id=image.frame_id, family=self._detector.family.name)
+
+    def _count(self, context: Context, discrete_state: DiscreteValues) -> None:
+        image = self._image_input.Eval(context)
+        last_stamp = context.get_discrete_state(self._last_stamp)[0]
+        if math.isfinite(image.stamp) and image.stamp != last_stamp:
+            discrete_state.set_value(self._last_stamp, [image.stamp])
+            self._counts.add(context, discrete_state, bad_image=not is_picture(image.data))

@@ -1,0 +1,401 @@
+"""The body's pose in the map, from all markers of the map that a picture shows, solved together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+from systems.cameras import PinholeCamera
+from systems.health import Counts
+from systems.markers.layout import MarkerMap
+from systems.markers.planar_pose import SAME_POSE, angle_between, closed_form, planar_poses
+from systems.markers.pnp import PnpSolution, covariance, cross_matrix, refine, squared_errors
+from systems.memo import Memo
+from systems.messages import Detections, PoseEstimate
+from systems.validation import require, require_non_negative, require_positive
+
+Array = NDArray[np.float64]
+
+REASONS = ("unknown_id", "repeated_id", "too_small", "bad_corners", "outlier", "inconsistent")
+
+
+@dataclass
+class LocalizerParameters:
+    """What is trusted.
+
+    Attributes:
+        pixel_noise: standard deviation of a corner's coordinate, px.
+        use: `all` markers together, or the `best` one (largest in the picture) alone.
+        min_side: markers whose shortest side is shorter are left out, px.
+        max_reprojection: a marker whose corners lie further (RMS) from where the common pose puts
+            them is left out, px; a pose that leaves more is none.
+        ambiguity_ratio: a pose counts as ambiguous unless its likelihood is this many times that
+            of the best other minimum.
+    """
+
+    pixel_noise: float = 0.3
+    use: str = "all"
+    min_side: float = 12.0
+    max_reprojection: float = 2.0
+    ambiguity_ratio: float = 1000.0
+
+    def __post_init__(self) -> None:
+        require_positive(
+            pixel_noise=self.pixel_noise,
+            max_reprojection=self.max_reprojection,
+            ambiguity_ratio=self.ambiguity_ratio,
+        )
+        require_non_negative(min_side=self.min_side)
+        require(self.use in ("all", "best"), "use", self.use, "'all' or 'best'")
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """What one picture says of the pose.
+
+    Attributes:
+        pose: the best pose; not `valid` when there is none.
+        alternative: the other minimum, when there is one; both solutions travel on.
+        dropped: reason (one of `REASONS`) to number of markers left out for it;
+            `inconsistent` counts pictures whose markers fit no common pose.
+    """
+
+    pose: PoseEstimate
+    alternative: PoseEstimate
+    dropped: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    """The markers of one picture.
+
+    Attributes:
+        index: (n,) where they are in the map.
+        points: (n, 4, 3) their corners in W, m.
+        rays: (n, 4, 2) x/z, y/z of the corners.
+        by_ray: (n, 4, 2, 2) derivative of the pixels by the rays, px.
+    """
+
+    index: NDArray[np.intp]
+    points: Array
+    rays: Array
+    by_ray: Array
+
+    def select(self, mask: NDArray[np.bool_]) -> _View:
+        if mask.all():
+            return self
+        return _View(self.index[mask], self.points[mask], self.rays[mask], self.by_ray[mask])
+
+    def refine(self, R: Array, p: Array) -> PnpSolution:
+        """Returns the minima over all corners together, from b poses."""
+        return refine(
+            R,
+            p,
+            self.points.reshape(-1, 3),
+            self.rays.reshape(-1, 2),
+            self.by_ray.reshape(-1, 2, 2),
+        )
+
+    def errors_by_marker(self, R: Array, p: Array) -> Array:
+        """Returns (b, n) squared errors of each marker under each of b poses, px^2."""
+        b, n = len(R), len(self.index)
+        errors = squared_errors(
+            R.repeat(n, axis=0),
+            p.repeat(n, axis=0),
+            np.tile(self.points, (b, 1, 1)),
+            np.tile(self.rays, (b, 1, 1)),
+            np.tile(self.by_ray, (b, 1, 1, 1)),
+        )
+        return errors.reshape(b, n)
+
+
+class MapLocalizer:
+    """Solves `X_WB` of the body from detections of a map's markers.
+
+    Args:
+        marker_map: the markers, in W.
+        camera: the camera.
+        X_BC: pose of the optical frame in the body.
+        parameters: what is trusted.
+        body_frame: name of the body's frame.
+    """
+
+    def __init__(
+        self,
+        *,
+        marker_map: MarkerMap,
+        camera: PinholeCamera,
+        X_BC: RigidTransform,
+        parameters: LocalizerParameters | None = None,
+        body_frame: str = "base_link",
+    ) -> None:
+        self.marker_map = marker_map
+        self.camera = camera
+        self.X_BC = X_BC
+        self.parameters = parameters or LocalizerParameters()
+        self.body_frame = body_frame
+        self._index = {marker.id: k for k, marker in enumerate(marker_map)}
+        self._sizes = np.array([marker.size for marker in marker_map])
+        self._corners = marker_map.corners(np.array(list(self._index)))
+        poses = [marker.X_WM for marker in marker_map]
+        self._R_MW = np.array([X.rotation().matrix().T for X in poses]).reshape(-1, 3, 3)
+        self._p_WM = np.array([X.translation() for X in poses]).reshape(-1, 3)
+
+    def locate(self, detections: Detections) -> Localization:
+        """Solves the body's pose from one picture's detections; never NaN, never an exception."""
+        dropped = dict.fromkeys(REASONS, 0)
+        seen = self._usable(detections, dropped)
+        nothing = PoseEstimate(
+            frame_id=self.marker_map.frame, child_frame_id=self.body_frame
+        )
+        if len(seen) == 0:
+            return Localization(nothing, nothing, dropped)
+        rays, by_ray = self.camera.rays(seen.corners)
+        index = np.array([self._index[int(i)] for i in seen.ids])
+        view = _View(index, self._corners[index], rays, by_ray)
+        used = np.ones(len(seen), bool)
+        if len(seen) == 1:
+            solutions = self._single(view)
+        else:
+            solvable, R_CM, p_CM = closed_form(rays, self._sizes[index])
+            dropped["bad_corners"] += int((~solvable).sum())
+            view = view.select(solvable)
+            solutions, used = self._common_pose(*self._candidates(R_CM, p_CM, view.index), view)
+        if len(solutions) == 0 or not np.isfinite(solutions.squared_error[0]):
+            dropped["bad_corners"] += len(view.index)
+            return Localization(nothing, nothing, dropped)
+        dropped["outlier"] += int((~used).sum())
+        rms = np.sqrt(solutions.squared_error / (4 * used.sum()))
+        if rms[0] > self.parameters.max_reprojection:
+            dropped["inconsistent"] += 1
+            return Localization(nothing, nothing, dropped)
+        ambiguous = False
+        if len(solutions) > 1:
+            # Twice the logarithm of the likelihood ratio of Gaussian corner noise.
+            excess = (solutions.squared_error[1] - solutions.squared_error[0]) / (
+                self.parameters.pixel_noise**2
+            )
+            ambiguous = bool(excess < 2 * np.log(self.parameters.ambiguity_ratio))
+        estimates = [
+            self._estimate(solutions, k, rms[k], detections.stamp, ambiguous, int(used.sum()))
+            for k in range(len(solutions))
+            if rms[k] <= self.parameters.max_reprojection
+        ]
+        return Localization(
+            estimates[0], estimates[1] if len(estimates) > 1 else nothing, dropped
+        )
+
+    def _usable(self, detections: Detections, dropped: dict[str, int]) -> Detections:
+        """Returns the detections of markers that the map knows, counting the others."""
+        ids = detections.ids
+        known = np.array([int(i) in self._index for i in ids], bool)
+        dropped["unknown_id"] += int((~known).sum())
+        values, counts = np.unique(ids, return_counts=True)
+        once = np.isin(ids, values[counts == 1])  # two of one id: none can be told to be the real
+        dropped["repeated_id"] += int((known & ~once).sum())
+        sides = np.linalg.norm(
+            detections.corners - np.roll(detections.corners, 1, axis=1), axis=2
+        ).min(axis=1, initial=np.inf)
+        finite = np.isfinite(sides)
+        large = sides >= self.parameters.min_side
+        dropped["bad_corners"] += int((known & once & ~finite).sum())
+        dropped["too_small"] += int((known & once & finite & ~large).sum())
+        seen = detections.select(known & once & finite & large)
+        if self.parameters.use == "best" and len(seen) > 1:
+            seen = seen.select(np.array([int(np.argmax(_areas(seen.corners)))]))
+        return seen
+
+    def _candidates(
+        self, R_CM: Array, p_CM: Array, index: NDArray[np.intp]
+    ) -> tuple[Array, Array]:
+        """Returns `X_CW` by each marker's two poses: (2n, 3, 3) and (2n, 3)."""
+        R_CW = R_CM @ self._R_MW[index][:, None]
+        p_CW = p_CM - (R_CW @ self._p_WM[index][:, None, :, None])[..., 0]
+        return R_CW.reshape(-1, 3, 3), p_CW.reshape(-1, 3)
+
+    def _single(self, view: _View) -> PnpSolution:
+        """Returns both poses by one marker: minima, or a minimum and its mirror image."""
+        poses = planar_poses(view.rays, view.by_ray, self._sizes[view.index])
+        R, p = self._candidates(poses.R, poses.p, view.index)
+        finite = np.isfinite(poses.squared_error[0])
+        return refine(
+            R[finite], p[finite], view.points[0], view.rays[0], view.by_ray[0], iterations=0
+        )
+
+    def _common_pose(
+        self, R: Array, p: Array, view: _View
+    ) -> tuple[PnpSolution, NDArray[np.bool_]]:
+        """Returns the best one or two minima over all markers and which markers they rest on.
+
+        The pose that most markers agree on is found among the candidates, by a robust vote: a
+        marker that lies further off than `max_reprojection` counts as much as one that lies there.
+        """
+        used = np.ones(len(view.index), bool)
+        limit = 4 * self.parameters.max_reprojection**2
+        # A marker's own pose, carried over to others, errs more than a common pose will: the vote
+        # is four times as patient as the verdict.
+        by_marker = view.errors_by_marker(R, p)
+        votes = np.minimum(by_marker, 16 * limit).sum(axis=1)
+        if not np.isfinite(by_marker).any():
+            return PnpSolution(R[:0], p[:0], votes[:0], np.zeros((0, 6, 6))), used
+        first = int(np.argmin(votes))
+        others = np.flatnonzero(angle_between(R, R[first]) > SAME_POSE)
+        start = np.array([first, *others[np.argsort(votes[others], kind="stable")][:1]])
+        solution = view.refine(R[start], p[start])
+        for _ in range(len(used) - 2):
+            by_marker = view.errors_by_marker(solution.R[:1], solution.p[:1])[0]
+            by_marker[~used] = -1.0
+            worst = int(np.argmax(by_marker))
+            if by_marker[worst] <= limit:
+                break
+            used[worst] = False
+            solution = view.select(used).refine(solution.R, solution.p)
+        return _distinct_best_first(solution), used
+
+    def _estimate(
+        self,
+        solutions: PnpSolution,
+        k: int,
+        rms: float,
+        stamp: float,
+        ambiguous: bool,
+        markers: int,
+    ) -> PoseEstimate:
+        R_CW, p_CW = solutions.R[k], solutions.p[k]
+        X_CW = RigidTransform(RotationMatrix(_orthonormal(R_CW)), p_CW)
+        X_WB = X_CW.inverse().multiply(self.X_BC.inverse())
+        cov_C = covariance(solutions.information[k], self.parameters.pixel_noise)
+        # (delta, tau) of X_CW in C  ->  (delta', d) of X_WB in W.
+        R_WC = R_CW.T
+        p_CB_W = R_WC @ self.X_BC.inverse().translation()
+        G = np.zeros((6, 6))
+        G[:3, :3] = -R_WC
+        G[3:, 3:] = -R_WC
+        G[3:, :3] = -R_WC @ cross_matrix(p_CW) + cross_matrix(p_CB_W) @ R_WC
+        cov = G @ cov_C @ G.T
+        return PoseEstimate(
+            stamp=stamp,
+            frame_id=self.marker_map.frame,
+            child_frame_id=self.body_frame,
+            pose=X_WB,
+            covariance=(cov + cov.T) / 2,
+            reprojection_rms=float(rms),
+            ambiguous=ambiguous,
+            markers=markers,
+        )
+
+
+def _distinct_best_first(solution: PnpSolution) -> PnpSolution:
+    """Orders by error; of two that ended in one minimum, keeps one."""
+    order = np.argsort(solution.squared_error, kind="stable")
+    if len(order) > 1:
+        same = angle_between(solution.R[order[0]], solution.R[order[1]]) < SAME_POSE
+        if same or not np.isfinite(solution.squared_error[order[1]]):
+            order = order[:1]
+    return PnpSolution(
+        solution.R[order],
+        solution.p[order],
+        solution.squared_error[order],
+        solution.information[order],
+    )
+
+
+def _areas(corners: Array) -> Array:
+    """Returns (n,) areas of quadrangles (n, 4, 2)."""
+    x, y = corners[..., 0], corners[..., 1]
+    return np.abs((x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(axis=1)) / 2
+
+
+def _orthonormal(R: Array) -> Array:
+    """Returns the rotation nearest to a product of many rotations."""
+    U, _, Vt = np.linalg.svd(R)
+    return U @ Vt
+
+
+class Localizer(LeafSystem):
+    """Turns detections into the body's pose in the map.
+
+    .. pydrake_system::
+
+        name: Localizer
+        input_ports:
+        - detections
+        output_ports:
+        - pose
+        - alternative
+        - health
+
+    Args:
+        localizer: the algorithm with its map, camera and mounting.
+        rate: how often new detections are looked for to count what was dropped, Hz; at least the
+            camera's.
+
+    Ports:
+        detections (input, Detections): of the map's family.
+        pose (output, PoseEstimate): `X_WB` with covariance, of the latest picture; not `valid`
+            (stamp NaN) when that shows no usable marker. `ambiguous` is set when the alternative
+            is nearly as likely.
+        alternative (output, PoseEstimate): the other minimum of the same picture, not `valid` when
+            there is none.
+        health (output, Health): markers left out, by reason (see `REASONS`).
+
+    Source: planar poses after Collins and Bartoli (2014), then all corners in one least-squares
+    problem with the covariance of its Jacobian.
+    """
+
+    def __init__(self, *, localizer: MapLocalizer, rate: float) -> None:
+        super().__init__()
+        require_positive(rate=rate)
+        self._localizer = localizer
+        self._memo = Memo(self, "localization")
+        self._detections_input = self.DeclareAbstractInputPort(
+            "detections", AbstractValue.Make(Detections())
+        )
+        ticket = {self._detections_input.ticket()}
+        self._pose_output = self.DeclareAbstractOutputPort(
+            "pose",
+            lambda: AbstractValue.Make(PoseEstimate()),
+            lambda context, output: output.set_value(self._locate(context).pose),
+            ticket,
+        )
+        self._alternative_output = self.DeclareAbstractOutputPort(
+            "alternative",
+            lambda: AbstractValue.Make(PoseEstimate()),
+            lambda context, output: output.set_value(self._locate(context).alternative),
+            ticket,
+        )
+        self._last_stamp = self.DeclareDiscreteState([np.nan])
+        self._counts = Counts(self, *REASONS)
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._count)
+
+    def detections_input_port(self) -> InputPort:
+        """Returns the port of the detections."""
+        return self._detections_input
+
+    def pose_output_port(self) -> OutputPort:
+        """Returns the port of the pose."""
+        return self._pose_output
+
+    def alternative_output_port(self) -> OutputPort:
+        """Returns the port of the second solution."""
+        return self._alternative_output
+
+    def health_output_port(self) -> OutputPort:
+        """Returns the port of what was left out."""
+        return self._counts.output_port
+
+    def _locate(self, context: Context) -> Localization:
+        detections = self._detections_input.Eval(context)
+        return self._memo(context, self._localizer.locate, detections)
+
+    def _count(self, context: Context, discrete_state: DiscreteValues) -> None:
+        detections = self._detections_input.Eval(context)
+        last_stamp = context.get_discrete_state(self._last_stamp)[0]
+        if np.isfinite(detections.stamp) and detections.stamp != last_stamp:
+            discrete_state.set_value(self._last_stamp, [detections.stamp])
+            self._counts.add(context, discrete_state, **self._locate(context).dropped)
