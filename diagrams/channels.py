@@ -73,7 +73,9 @@ class Signal:
         topics = reader.topics()
         if self.topic not in topics:
             have = ", ".join(sorted(topics))
-            raise ScenarioError(f"recording {reader.path}: lacks the topic {self.topic}; has {have}")
+            raise ScenarioError(
+                f"recording {reader.path}: lacks the topic {self.topic}; has {have}"
+            )
         entries = read_channel(reader, self.topic, self.decode)
         end = entries[-1].log_time * 1e-9 if entries else 0.0
         if isinstance(self.model, int):
@@ -154,7 +156,7 @@ def truth_signal(robot: str) -> Signal:
 
 
 def estimate_signal(robot: str, rate: float) -> Signal:
-    """Returns the signal of a planar estimate: vector of 12, the pose and its covariance by rows."""
+    """Returns the signal of a planar estimate: (12,) the pose, then its covariance by rows."""
     return Signal(
         port=f"{robot}.estimate",
         topic=f"/{robot}/estimate",

@@ -1,4 +1,4 @@
-"""The command line. Exit status: 0 fulfilled, 1 ran but failed, 2 bad input (one line says what)."""
+"""The command line. Exit status: 0 fulfilled, 1 ran but failed, 2 bad input (in one line)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
 
-    def command(name: str, function: Callable[[argparse.Namespace], int], text: str) -> argparse.ArgumentParser:
+    def command(
+        name: str, function: Callable[[argparse.Namespace], int], text: str
+    ) -> argparse.ArgumentParser:
         sub = commands.add_parser(name, help=text, description=text)
         sub.set_defaults(function=function)
         return sub
@@ -70,7 +72,9 @@ def _parser() -> argparse.ArgumentParser:
 
     detect = command("detect", _detect, "find markers in pictures, videos, recordings")
     detect.add_argument("source", type=Path, help="picture, folder, video or recording")
-    detect.add_argument("--family", help="marker family, 36h11 or DICT_4X4_50 for example")
+    detect.add_argument(
+        "--family", required=True, help="marker family, 36h11 or DICT_4X4_50 for example"
+    )
     detect.add_argument("--size", type=float, metavar="M", help="side of the black square, metres")
     detect.add_argument("--camera", type=Path, metavar="FILE", help="camera file")
     detect.add_argument("--out", type=Path, default=Path("out/detect"), metavar="DIR")
@@ -92,9 +96,8 @@ def _run(options: argparse.Namespace) -> int:
     from diagrams.scenario import load_scenario
 
     overrides = list(options.set)
-    for key in ("seed", "duration"):
-        if getattr(options, key) is not None:
-            overrides.append(f"{key}={getattr(options, key)}")
+    given = {key: getattr(options, key) for key in ("seed", "duration")}
+    overrides += [f"{key}={value}" for key, value in given.items() if value is not None]
     if options.play:
         overrides.append(f"recording={options.play}")
     scenario = load_scenario(options.scenario, overrides)
@@ -147,7 +150,9 @@ def _detect(options: argparse.Namespace) -> int:
             out=options.out,
             progress=progress,
         )
-    table = RichTable("picture", "markers", "ids")
+    table = RichTable()
+    for column in ("picture", "markers", "ids"):
+        table.add_column(column, overflow="fold")
     for row in summary:
         table.add_row(*row)
     console.print(table)

@@ -8,14 +8,21 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
+from pydrake.systems.framework import (
+    Context,
+    Diagram,
+    DiagramBuilder,
+    InputPort,
+    OutputPort,
+    System,
+)
+from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 
 from diagrams.channels import Signal
 from diagrams.scenario import Scenario
 from diagrams.schema import ScenarioError
 from diagrams.station import RobotParameters, Station, WorldParameters
-from pydrake.geometry import Meshcat, MeshcatVisualizer, MeshcatVisualizerParams, Role
-from pydrake.systems.framework import Context, Diagram, DiagramBuilder, InputPort, OutputPort, System
-from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from systems.io.bag import BagReader, BagWriter
 from systems.io.recorder import Recorder
 from systems.validation import nearest
@@ -69,6 +76,7 @@ class Wiring:
             visualizer = MeshcatVisualizer(meshcat, parameters)
             visualizer.set_name("meshcat")
             self.builder.AddSystem(visualizer)
+            _look_at(meshcat, world)
             self.builder.Connect(
                 self.output("scene.query_object"), visualizer.query_object_input_port()
             )
@@ -166,6 +174,17 @@ class Wiring:
             f"the station has no {kind.lower()} port {name!r}; "
             f"{nearest(name, _port_names(self.station, kind))}"
         )
+
+
+def _look_at(meshcat: Meshcat, world: WorldParameters) -> None:
+    """Points Meshcat's camera at the arena, from the south and above, without axes and grid."""
+    walls = world.arena.walls
+    ends = np.array([end for wall in walls for end in (wall.start, wall.end)] or [[-1, -1], [1, 1]])
+    middle, extent = (ends.max(axis=0) + ends.min(axis=0)) / 2, np.ptp(ends, axis=0).max()
+    eye = [middle[0], middle[1] - 0.55 * extent, 0.75 * extent]
+    meshcat.SetCameraPose(eye, [*middle, 0.0])
+    for name in ("/Grid", "/Axes"):
+        meshcat.SetProperty(name, "visible", False)
 
 
 def _port_names(system: System, kind: str) -> list[str]:

@@ -11,6 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context
+from pydrake.systems.primitives import Multiplexer
 
 from diagrams.channels import estimate_signal
 from diagrams.metrics import PoseLog, path_length, pose_metrics
@@ -22,23 +25,16 @@ from diagrams.tables import Choice, Table
 from diagrams.trajectories import write_tum
 from diagrams.viewer import EstimateViewer
 from plants.arena import check_free
-from pydrake.geometry import Meshcat
-from pydrake.systems.framework import Context
-from pydrake.systems.primitives import Multiplexer
+from systems.angles import spatial_pose
 from systems.controllers.search import SearchParameters, SearchWhenLost
 from systems.estimators.planar_kalman import UNKNOWN
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
-from systems.angles import spatial_pose
 from systems.markers.localizer import Localizer, LocalizerParameters, MapLocalizer
 from systems.planners.waypoint_sequencer import WaypointSequencer
 from systems.validation import require, require_positive
 
-ESTIMATORS = Table(
-    "estimator", {"kf": "systems.estimators.planar_kalman:PlanarKalmanFilter"}
-)
-CONTROLLERS = Table(
-    "controller", {"waypoint": "systems.controllers.waypoints:WaypointController"}
-)
+ESTIMATORS = Table("estimator", {"kf": "systems.estimators.planar_kalman:PlanarKalmanFilter"})
+CONTROLLERS = Table("controller", {"waypoint": "systems.controllers.waypoints:WaypointController"})
 
 ROBOT = "robot"
 
@@ -225,9 +221,7 @@ def _connect(wiring: Wiring, scenario: NavigationScenario) -> None:
     wiring.connect("search.command", f"{ROBOT}.drive.command")
 
 
-def _show(
-    wiring: Wiring, scenario: NavigationScenario, meshcat: Meshcat, has_truth: bool
-) -> None:
+def _show(wiring: Wiring, scenario: NavigationScenario, meshcat: Meshcat, has_truth: bool) -> None:
     wiring.add(
         EstimateViewer(
             meshcat=meshcat,

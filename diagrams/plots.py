@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -18,9 +19,9 @@ from systems.markers.layout import MarkerMap
 
 Array = NDArray[np.float64]
 
-_TRUTH = {"color": "black", "linestyle": "-", "linewidth": 1.6}
-_ESTIMATE = {"color": "tab:red", "linestyle": "--", "linewidth": 1.6}
-_BOUND = {"color": "tab:blue", "linestyle": ":", "linewidth": 1.2}
+_TRUTH: dict[str, Any] = {"color": "black", "linestyle": "-", "linewidth": 1.6}
+_ESTIMATE: dict[str, Any] = {"color": "tab:red", "linestyle": "--", "linewidth": 1.6}
+_BOUND: dict[str, Any] = {"color": "tab:blue", "linestyle": ":", "linewidth": 1.2}
 
 
 def plot_navigation(
@@ -44,7 +45,7 @@ def plot_navigation(
     """
     figure = Figure(figsize=(12.0, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = figure.subfigures(1, 2, width_ratios=[1.0, 1.05])
+    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=[1.0, 1.05]))
     _plan(left.subplots(), log, waypoints, radius, walls, markers)
     axes = right.subplots(4 if log.truth is not None else 3, 1, sharex=True)
     if log.truth is None:
@@ -88,7 +89,7 @@ def _plan(
         a, b, angle = ellipse(log.covariance[k, :2, :2])
         ax.add_patch(
             Ellipse(
-                log.estimate[k, :2],
+                (log.estimate[k, 0], log.estimate[k, 1]),
                 2 * a,
                 2 * b,
                 angle=np.degrees(angle),
@@ -113,11 +114,13 @@ def _errors(axes: Array, log: PoseLog) -> None:
     deviations = np.sqrt(np.einsum("nii->ni", covariance)) * [100.0, 100.0, np.degrees(1.0)]
     for k, label in enumerate(("x [cm]", "y [cm]", "heading [deg]")):
         axes[k].plot(t, errors[:, k], color="tab:red", linewidth=1.0, label="estimate - truth")
-        for sign in (1, -1):
-            axes[k].plot(t, sign * 2 * deviations[:, k], **_BOUND, label="2 sigma"[: 7 * sign])
+        bound = 2 * deviations[:, k]
+        axes[k].fill_between(t, -bound, bound, color="0.85", linewidth=0, label="2 sigma")
         axes[k].set_ylabel(f"error in {label}")
         axes[k].grid(alpha=0.3)
-        limit = max(2.5 * float(np.quantile(deviations[:, k], 0.9)), 1.2 * np.abs(errors[:, k]).max())
+        limit = max(
+            2.5 * float(np.quantile(deviations[:, k], 0.9)), 1.2 * np.abs(errors[:, k]).max()
+        )
         axes[k].set_ylim(-limit, limit)
     axes[0].legend(loc="upper right", fontsize=8, ncol=2)
     axes[3].semilogy(t, np.maximum(nees(log.errors(), covariance), 1e-2), color="tab:red", lw=1.0)
@@ -137,9 +140,7 @@ def _poses(axes: Array, log: PoseLog) -> None:
         axes[k].grid(alpha=0.3)
 
 
-def _every(known: NDArray[np.bool_], count: int) -> Array:
+def _every(known: NDArray[np.bool_], count: int) -> NDArray[np.intp]:
     """Returns about `count` indices, evenly over those that are known."""
     index = np.flatnonzero(known)
     return index[:: max(1, len(index) // count)]
-
-

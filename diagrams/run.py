@@ -11,11 +11,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from diagrams.mission import FRAME_RATE, Mission
-from diagrams.scenario import Scenario, save_scenario
 from pydrake.geometry import Meshcat, MeshcatParams
 from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorConfig
 from pydrake.systems.framework import Context
+
+from diagrams.mission import FRAME_RATE, Mission
+from diagrams.scenario import Scenario, save_scenario
 
 _MAX_STEP = 0.01  # s, of the integrator; only kinematic twins have continuous state
 

@@ -111,7 +111,9 @@ def find_scenario(name: str, folders: Iterable[Path] = ()) -> Path:
             return path
     if "/" in name or name.endswith((".yaml", ".yml")):
         raise ScenarioError(f"scenario {name}: no such file")
-    raise ScenarioError(f"scenario {name!r}: no such file or bundled name; {nearest(name, bundled)}")
+    raise ScenarioError(
+        f"scenario {name!r}: no such file or bundled name; {nearest(name, bundled)}"
+    )
 
 
 def load_scenario(name: str, overrides: Iterable[str] | Mapping[str, Any] = ()) -> Any:

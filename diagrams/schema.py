@@ -177,9 +177,7 @@ def _file(name: str, note: File, place: Place) -> str:
         return name
     have = sorted(path.name for path in bundled.iterdir())
     where = " or ".join(str(folder) for folder in place.folders) or "the current folder"
-    raise place.error(
-        f"{place} is {name!r}: no such file in {where}; bundled: {', '.join(have)}"
-    )
+    raise place.error(f"{place} is {name!r}: no such file in {where}; bundled: {', '.join(have)}")
 
 
 def file_path(name: str, folder: str) -> Path:

@@ -10,17 +10,10 @@ from __future__ import annotations
 
 import math
 import typing
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
 import numpy as np
-
-from diagrams.channels import Signal
-from diagrams.schema import File, ScenarioError, file_path
-from diagrams.tables import Choice, Table
-from plants.arena import ArenaParameters, add_arena
-from plants.body_state import TwinPositions
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import (
@@ -30,6 +23,12 @@ from pydrake.multibody.plant import (
 )
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
+
+from diagrams.channels import Signal
+from diagrams.schema import File, ScenarioError, file_path
+from diagrams.tables import Choice, Table
+from plants.arena import ArenaParameters, add_arena
+from plants.body_state import TwinPositions
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap, load_map
@@ -379,9 +378,7 @@ def _show_twins(station: StationBuilder, robots: list[Robot]) -> None:
         MultibodyPositionToGeometryPose(station.plant, input_multibody_state=False), "twin_geometry"
     )
     source = station.plant.get_source_id()
-    station.connect(
-        to_geometry.get_output_port(), station.scene_graph.get_source_pose_port(source)
-    )
+    station.connect(to_geometry.get_output_port(), station.scene_graph.get_source_pose_port(source))
     positions = station.add(
         TwinPositions(plant=station.plant, models=[robot.name for robot in robots]),
         "twin_positions",

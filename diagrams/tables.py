@@ -17,9 +17,12 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import inspect
+import sys
 import typing
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from diagrams.schema import Place, check_keys, construct, convert, field_hints, to_plain
@@ -123,11 +126,11 @@ class Table:
             )
         module_name, class_name = path.split(":", 1)
         try:
-            module = importlib.import_module(module_name)
+            with _importable_from(place.folders):
+                module = importlib.import_module(module_name)
         except Exception as error:  # whatever a user's module raises while it is imported
             raise place.error(
-                f"{place} is {name!r}: cannot import {module_name}: "
-                f"{type(error).__name__}: {error}"
+                f"{place} is {name!r}: cannot import {module_name}: {type(error).__name__}: {error}"
             ) from error
         if not hasattr(module, class_name):
             names = [n for n, v in vars(module).items() if inspect.isclass(v)]
@@ -136,6 +139,17 @@ class Table:
                 f"{nearest(class_name, names)}"
             )
         return getattr(module, class_name)
+
+
+@contextmanager
+def _importable_from(folders: Iterable[Path]) -> Iterator[None]:
+    """Lets a user's module lie beside the scenario that names it."""
+    before = list(sys.path)
+    sys.path += [str(folder.resolve()) for folder in folders]
+    try:
+        yield
+    finally:
+        sys.path[:] = before
 
 
 def _constructor(target: Any) -> Any:

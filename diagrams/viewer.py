@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-
-from plants.differential_drive import DifferentialDriveParameters
 from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, InputPort, LeafSystem
+
+from plants.differential_drive import DifferentialDriveParameters
 from systems.angles import spatial_pose
 
 Array = NDArray[np.float64]
@@ -21,7 +21,7 @@ _ROOT = "view"
 _SIGMAS = 2.4477  # semi-axes of the planar 95 % ellipse, in standard deviations
 _STEP = 0.10  # m between two marks of a path
 _MAX_SEMI_AXIS = 5.0  # m; larger ellipses are drawn as this
-_LIFT = 0.004  # m above the ground
+_ABOVE = 0.03  # m; the ellipse floats over the robot, which would hide it
 
 
 def ellipse(covariance: Array) -> tuple[float, float, float]:
@@ -77,9 +77,10 @@ class EstimateViewer(LeafSystem):
         # Where the last mark of each path was drawn: what the browser holds, not the diagram.
         self._last: dict[str, Array] = {}
         self._count = {"estimate": 0, "truth": 0}
+        self._top = body.clearance + body.height + _ABOVE
         self._draw_ghost(body)
         self._draw_waypoints(waypoints, radius)
-        meshcat.SetObject(f"{_ROOT}/ellipse/disc", Cylinder(1.0, 0.002), Rgba(0.9, 0.2, 0.2, 0.35))
+        meshcat.SetObject(f"{_ROOT}/ellipse/disc", Cylinder(1.0, 0.002), Rgba(1.0, 0.85, 0.1, 0.9))
         self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
 
     def pose_input_port(self) -> InputPort:
@@ -99,9 +100,7 @@ class EstimateViewer(LeafSystem):
         middle = body.clearance + body.height / 2
         chassis = Box(body.length, body.width, body.height)
         self._meshcat.SetObject(f"{_ROOT}/estimate/chassis", chassis, ghost)
-        self._meshcat.SetTransform(
-            f"{_ROOT}/estimate/chassis", RigidTransform([0.0, 0.0, middle])
-        )
+        self._meshcat.SetTransform(f"{_ROOT}/estimate/chassis", RigidTransform([0.0, 0.0, middle]))
         for side, y in (("right", -1), ("left", 1)):
             name = f"{_ROOT}/estimate/{side}_wheel"
             self._meshcat.SetObject(name, Cylinder(body.wheel_radius, body.wheel_width), ghost)
@@ -117,9 +116,7 @@ class EstimateViewer(LeafSystem):
             self._meshcat.SetObject(
                 f"{name}/area", Cylinder(radius, 0.002), Rgba(0.2, 0.6, 0.3, 0.25)
             )
-            self._meshcat.SetObject(
-                f"{name}/post", Cylinder(0.01, 0.3), Rgba(0.2, 0.6, 0.3, 0.9)
-            )
+            self._meshcat.SetObject(f"{name}/post", Cylinder(0.01, 0.3), Rgba(0.2, 0.6, 0.3, 0.9))
             self._meshcat.SetTransform(f"{name}/post", RigidTransform([0.0, 0.0, 0.15]))
 
     def _draw(self, context: Context) -> None:
@@ -133,9 +130,9 @@ class EstimateViewer(LeafSystem):
         if known:
             a, b, angle = ellipse(covariance[:2, :2])
             self._meshcat.SetTransform(f"{_ROOT}/estimate", spatial_pose(pose), t)
-            at = spatial_pose(np.array([pose[0], pose[1], angle]), _LIFT)
+            at = spatial_pose(np.array([pose[0], pose[1], angle]), self._top)
             self._meshcat.SetTransform(f"{_ROOT}/ellipse", at, t)
-            size = [min(max(s, 1e-3), _MAX_SEMI_AXIS) for s in (a, b)]
+            size = [min(max(s, 5e-3), _MAX_SEMI_AXIS) for s in (a, b)]
             self._meshcat.SetProperty(f"{_ROOT}/ellipse/disc", "scale", [*size, 1.0], t)
             self._mark("estimate", pose, t)
         if self._show_truth:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
 from pydrake.common import MemoryFile
 from pydrake.geometry import Box, GeometryInstance, InMemoryMesh, Mesh
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import RigidBody
+
 from systems.markers.family import Family
 from systems.validation import require, require_positive
 

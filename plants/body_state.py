@@ -1,4 +1,4 @@
-"""What a robot's body does, on ports that do not depend on the plant: pose, velocity, acceleration."""
+"""What a robot's body does, on the same ports for a multibody model and a kinematic twin."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import math
 from typing import Any
 
 import numpy as np
-
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
+
 from systems.angles import spatial_pose, wrap
 from systems.validation import require
 
@@ -140,9 +140,7 @@ class TwinState(LeafSystem):
         self.DeclareAbstractOutputPort(
             "pose",
             lambda: AbstractValue.Make(RigidTransform()),
-            lambda context, output: output.set_value(
-                spatial_pose(self._pose_input.Eval(context))
-            ),
+            lambda context, output: output.set_value(spatial_pose(self._pose_input.Eval(context))),
             pose_only,
         )
         self.DeclareVectorOutputPort("planar_pose", 3, self._calc_planar_pose, pose_only)

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from pydrake.geometry import Box, Cylinder, Sphere
 from pydrake.math import RigidTransform, RotationMatrix, cos, sin
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
@@ -20,6 +19,7 @@ from pydrake.multibody.tree import (
 )
 from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
+
 from systems.validation import require, require_positive
 
 _WHEEL_FRICTION = CoulombFriction(1.0, 1.0)
@@ -260,9 +260,7 @@ def KinematicDifferentialDrive_(T: Any) -> Any:  # noqa: D103 - the class carrie
             return self._velocity_output
 
         def _velocity(self, context: Any) -> np.ndarray:
-            return np.array(
-                body_velocity(self._wheel_speeds_input.Eval(context), self.parameters)
-            )
+            return np.array(body_velocity(self._wheel_speeds_input.Eval(context), self.parameters))
 
         def DoCalcTimeDerivatives(self, context: Any, derivatives: Any) -> None:
             theta = context.get_continuous_state_vector().GetAtIndex(2)

@@ -11,12 +11,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.systems.sensors import CameraInfo
 from ruamel.yaml import YAML, YAMLError
 
-from pydrake.systems.sensors import CameraInfo
 from systems.validation import require
 
 Array = NDArray[np.float64]
@@ -260,5 +259,7 @@ def camera_from_mapping(content: Any) -> PinholeCamera:
         try:
             numbers[name] = np.array(content.get(name, []), float).ravel()
         except (TypeError, ValueError):
-            raise ValueError(f"{name} is {content.get(name)!r}: must be a list of numbers") from None
+            raise ValueError(
+                f"{name} is {content.get(name)!r}: must be a list of numbers"
+            ) from None
     return PinholeCamera(content["width"], content["height"], numbers["K"], numbers["D"])

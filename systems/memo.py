@@ -26,9 +26,7 @@ class Memo:
     def __init__(self, system: LeafSystem, name: str) -> None:
         self._entry = system.DeclareCacheEntry(
             f"memo of {name}",
-            ValueProducer(
-                allocate=lambda: AbstractValue.Make([]), calc=ValueProducer.NoopCalc
-            ),
+            ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=ValueProducer.NoopCalc),
             {system.nothing_ticket()},
         )
 

@@ -14,7 +14,6 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-
 from pydrake.math import RigidTransform
 
 Array = NDArray[np.float64]

@@ -11,8 +11,8 @@ from __future__ import annotations
 import hashlib
 
 import numpy as np
-
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
+
 from systems.validation import require
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.primitives import MatrixGain
 
 from diagrams.channels import truth_signal
 from diagrams.station import Robot, StationBuilder
@@ -16,8 +18,6 @@ from plants.differential_drive import (
     hull_radius,
     wheel_speeds,
 )
-from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.primitives import MatrixGain
 from systems.angles import spatial_pose
 
 

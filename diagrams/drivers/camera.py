@@ -7,14 +7,14 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 import numpy as np
-
-from diagrams.channels import detections_signal, image_signal
-from diagrams.schema import File, file_path
-from diagrams.station import RENDERER, Robot, StationBuilder
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import OutputPort
 from pydrake.systems.primitives import ConstantValueSource
+
+from diagrams.channels import detections_signal, image_signal
+from diagrams.schema import File, file_path
+from diagrams.station import RENDERER, Robot, StationBuilder
 from systems.cameras import PinholeCamera, load_camera
 from systems.image_effects import ImageEffects
 from systems.io.ros_vision import camera_to_ros
@@ -25,9 +25,7 @@ from systems.sensors.rendered_camera import RenderedCamera
 from systems.validation import require, require_non_negative, require_positive
 
 # Columns: the optical frame's axes (right, down, forward) in a frame with x forward and z up.
-R_FORWARD_OPTICAL = RotationMatrix(
-    np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
-)
+R_FORWARD_OPTICAL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 
 
 @dataclass

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+
 from systems.health import Counts
 from systems.validation import require_non_negative, require_positive
 

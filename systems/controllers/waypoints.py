@@ -10,12 +10,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-
 from pydrake.math import atan2, cos, sin, sqrt
 from pydrake.math import max as drake_max
 from pydrake.math import min as drake_min
 from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
+
 from systems.validation import require_positive
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+
 from systems.health import Counts
 from systems.validation import require_positive
 

@@ -294,6 +294,8 @@ class BagReader:
     def messages(self, topics: Collection[str] | None = None) -> Iterator[tuple[str, float, Any]]:
         """Yields (topic, log time (s), message) in log-time order.
 
+        A float keeps times since 1970 to a quarter of a microsecond; `records` has them exactly.
+
         Args:
             topics: only these; all when None.
 

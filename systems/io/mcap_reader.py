@@ -68,13 +68,16 @@ class McapSource:
         truncated: something is missing: a file's end was cut off, or a part is damaged.
 
     Raises:
-        ValueError: a file is no MCAP file; the message names it.
+        ValueError: none of them is an MCAP file.
         OSError: a file cannot be read.
     """
 
     def __init__(self, paths: list[Path]) -> None:
-        self._indexes = [_read_index(path) or _scan(path) for path in paths]
-        self.truncated = not all(index.complete for index in self._indexes)
+        found = [_read_index(path) or _scan(path) for path in paths]
+        self._indexes = [index for index in found if index is not None]
+        if not self._indexes:
+            raise ValueError("not an MCAP file")
+        self.truncated = not all(index is not None and index.complete for index in found)
         self.topics: dict[str, str] = {}
         for index in self._indexes:
             for channel in index.channels.values():
@@ -158,16 +161,12 @@ def _read_index(path: Path) -> _Index | None:
     return index
 
 
-def _scan(path: Path) -> _Index:
-    """Returns the index of a file whose end is missing, as far as it goes.
-
-    Raises:
-        ValueError: it does not begin like an MCAP file.
-    """
+def _scan(path: Path) -> _Index | None:
+    """Returns the index of a file whose end is missing, as far as it goes; None: no MCAP file."""
     index = _Index(path)
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise ValueError(f"{path} is not an MCAP file")
+            return None
         offset = file.tell()
         while (loaded := _load(file, offset)) is not None:
             opcode, content = loaded

@@ -200,9 +200,7 @@ class VectorPlayback(LeafSystem):
         self._health_output = self.DeclareAbstractOutputPort(
             "health",
             lambda: AbstractValue.Make(Health()),
-            lambda context, output: output.set_value(
-                Health(self._track.dropped(context.get_time()))
-            ),
+            self._calc_health,
             {self.time_ticket()},
         )
 
@@ -214,8 +212,11 @@ class VectorPlayback(LeafSystem):
         """Returns the port of what was left out."""
         return self._health_output
 
-    def _calc_value(self, context: Context, output: BasicVector) -> None:
+    def _calc_value(self, context: Any, output: Any) -> None:
         output.SetFromVector(self._values[self._track.index(context.get_time()) + 1])
+
+    def _calc_health(self, context: Any, output: Any) -> None:
+        output.set_value(Health(self._track.dropped(context.get_time())))
 
 
 class MessagePlayback(LeafSystem):
@@ -257,7 +258,7 @@ class MessagePlayback(LeafSystem):
         self._value_output = self.DeclareAbstractOutputPort(
             "value",
             lambda: AbstractValue.Make(nothing),
-            lambda context, output: output.set_value(self._value(context)),
+            self._calc_value,
             {self.time_ticket()},
         )
         self._health_output = self.DeclareAbstractOutputPort(
@@ -290,7 +291,10 @@ class MessagePlayback(LeafSystem):
                 memory.undecodable.add(index)
         return memory.value if index >= 0 else self._nothing
 
-    def _calc_health(self, context: Context, output: AbstractValue) -> None:
+    def _calc_value(self, context: Any, output: Any) -> None:
+        output.set_value(self._value(context))
+
+    def _calc_health(self, context: Any, output: Any) -> None:
         t = context.get_time()
         counts = self._track.dropped(t)
         self._value(context)  # so that the picture of this moment counts, whoever asks first

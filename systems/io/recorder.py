@@ -144,7 +144,7 @@ class Recorder(LeafSystem):
         try:
             self._writer.close()
         except OSError as error:
-            self._warn("close", f"recording stopped: {error}")
+            self._warn("disk", f"end of the recording: {error}")
 
     def _record_static(self, context: Context) -> None:
         # Once, though a simulation may be initialised again.

@@ -227,10 +227,10 @@ def _quaternion(pose: RigidTransform) -> Any:
 
 
 def _rigid(position: Any, orientation: Any) -> RigidTransform:
-    q = np.array([orientation.w, orientation.x, orientation.y, orientation.z])
+    # Any: pydrake's stubs ask for an array type that NumPy's own do not give.
+    q: Any = np.array([orientation.w, orientation.x, orientation.y, orientation.z])
+    p: Any = np.array([position.x, position.y, position.z])
     length = float(np.linalg.norm(q))
     # Written so that NaN is refused.
     require(abs(length - 1) <= _QUATERNION_TOLERANCE, "length of quaternion", length, "1")
-    return RigidTransform(
-        RotationMatrix(Quaternion(q / length)), [position.x, position.y, position.z]
-    )
+    return RigidTransform(RotationMatrix(Quaternion(q / length)), p)

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.cameras import PinholeCamera
-from systems.markers.corner_refinement import to_ideal, to_picture
 from systems.markers.family import Family
 
 Array = NDArray[np.float64]
@@ -58,11 +57,11 @@ class CodeReader:
         ring = np.minimum(np.minimum(row, column), side - 1 - np.maximum(row, column))
         u = (column - 0.5) / family.cells
         v = (row - 0.5) / family.cells
-        self._cells = np.stack([u, v, np.ones_like(u)])
+        self._cells = np.stack([u, v, np.ones_like(u)], axis=-1)
         to_threshold = np.zeros((len(ring), len(ring)))  # from samples
         for which in (0, 1):
-            fit = np.linalg.pinv(self._cells[:, ring == which].T)
-            to_threshold[ring == which] += (self._cells.T @ fit).T / 2
+            fit = np.linalg.pinv(self._cells[ring == which])
+            to_threshold[ring == which] += (self._cells @ fit).T / 2
         near = np.abs(row[:, None] - row) + np.abs(column[:, None] - column) == 1
         sharpen = np.eye(len(ring)) + _SHARPENING * (np.diag(near.sum(axis=1)) - near)
         self._to_above = ((np.eye(len(ring)) - to_threshold) @ sharpen.T).astype(np.float32)
@@ -109,11 +108,6 @@ class CodeReader:
 
     def _places(self, corners: Array, camera: PinholeCamera | None) -> Array:
         """Returns the cells' centres in the picture, (n, cells, 2) px."""
-        lens = camera if camera is not None and camera.distorted else None
-        points = np.ascontiguousarray(corners, float)
-        if lens is not None:
-            points = _pairs(to_ideal(_complex(points), lens))
-        H = [cv2.getPerspectiveTransform(_SQUARE, c) for c in points.astype(np.float32)]
-        homogeneous = np.array(H).reshape(-1, 3, 3) @ self._cells
-        places = homogeneous[:,:2]/homogeneous[:,2:]
-        return places.swapaxes(1,2)
+        H = [cv2.getPerspectiveTransform(_SQUARE, c) for c in corners.astype(np.float32)]
+        homogeneous = self._cells @ np.array(H).reshape(-1, 3, 3).swapaxes(1,2)
+        return homogeneous[..., :2]/homogeneous[..., 2:]

@@ -36,7 +36,7 @@ _MOST_LEFT_OUT = 0.5  # of half an edge, however short
 
 # The search for the step.
 _SEARCH_LINES = 12
-_SEARCH_SHARE = 0.75  # of an edge
+_SEARCH_SHARE = 0.88  # of an edge, away from its corners
 _SEARCH_SAMPLES = 13
 _SEARCH_RANGE = 3.0  # px either side
 _SEARCH_CELLS = (0.4, 1.3)  # it grows to the first share of a cell, and is never above the second
@@ -51,9 +51,7 @@ _SHARP = 0.6  # px, the least standard deviation that a step has: pixel square a
 _WINDOW = 2.5  # half the window, in standard deviations of the step
 _CLEAR = 1.7  # as many are kept away from the next edges, one cell further in and out
 _NARROWEST = 1.0  # px
-_TOLERANCE = (
-    0.05  # of half the window: an offset from the line that is never held against a scan line
-)
+_TOLERANCE = 0.1  # of half the window: scan lines this close to their line all count alike
 _CORNER = 1.0  # px beyond the window's half width that are left out at either end of an edge
 
 
@@ -82,8 +80,7 @@ def refine_corners(
     start = np.ascontiguousarray(corners, float).view(np.complex128)[..., 0]
     with np.errstate(all="ignore"):
         edges = _edges(start if lens is None else to_ideal(start, lens), cells)
-        edges, blur = _search(image, edges, lens)
-        found = _intersections(_measure(image, edges, blur, lens))
+        found = _intersections(_measure(image, edges, *_search(image, edges, lens), lens))
         if lens is not None:
             found = to_picture(found, lens)
         np.copyto(found, start, where=~(np.abs(found - start) < _SEARCH_LIMIT))  # NaN too
@@ -106,22 +103,13 @@ def to_picture(points: Points, camera: PinholeCamera) -> Points:
 
 
 class _Edges(NamedTuple):
-    """The edges of n markers, (4n,) each; edge 4m + i runs from corner i of marker m to the next.
-
-    An edge is the line `middle` + u `half`, u from -1 to 1.
-    """
+    """The edges of n markers, (4n,) each; edge 4m + i of marker m starts at its corner i."""
 
     middle: Points
-    half: Points
+    half: Points  # from the middle to the end
     length: Array  # of half, px
     normal: Points  # outward, of length 1
     cell: Array  # the least width of the cells beside it, px
-
-    def moved(self, offset: Array, slope: Array) -> _Edges:
-        """Moves the edges by (offset + slope u) along their normals."""
-        middle = self.middle + offset * self.normal
-        half = self.half + slope * self.normal
-        return _Edges(middle, half, self.length, self.normal, self.cell)
 
 
 def _edges(corners: Points, cells: int) -> _Edges:
@@ -134,103 +122,111 @@ def _edges(corners: Points, cells: int) -> _Edges:
     return _Edges(middle.ravel(), half.ravel(), length.ravel(), normal.ravel(), cell.ravel())
 
 
-def _search(image: Grey, edges: _Edges, lens: PinholeCamera | None) -> tuple[_Edges, Array]:
+def _search(image: Grey, edges: _Edges, lens: PinholeCamera | None) -> tuple[Points, Array]:
     """Finds the edges roughly: lines through the squared rise of grey level across them.
 
     Only rises count: the steps next to an edge, from a white code cell to the border inward and
     from the paper to what lies behind it outward, are falls.
 
     Returns:
-        The edges, and the standard deviation of each one's step, (4n,) px.
+        The lines, (2, 4n): a point in the middle and the vector from there to the end of what was
+        scanned; and the standard deviation of each one's step, (4n,) px.
     """
     narrow, wide = _SEARCH_CELLS
     reach = np.minimum(np.maximum(narrow * edges.cell, _SEARCH_RANGE), _SEARCH_LIMIT)
     reach = np.minimum(reach, wide * edges.cell)
-    profiles = _profiles(image, edges, _SEARCH_SHARE, reach, _SEARCH_PLACES, lens)
+    frame = np.array([edges.middle, edges.half * _SEARCH_SHARE, edges.normal * reach])
+    profiles = _profiles(image, frame, _SEARCH_PLACES, lens)
     rise = profiles[1:] - profiles[:-1]
     np.maximum(rise, 0.0, out=rise)
     rise *= rise
-    # Moments of the rise across the edge (rows) and along it (columns), for each edge.
-    moments = (_ACROSS @ rise.reshape(len(rise), -1)).reshape(3, -1, len(reach))
+    moments = (_ACROSS @ rise.reshape(len(rise), -1)).reshape(3, _SEARCH_LINES, -1)
     # So that no scan line counts more than the others together, however bright its rise.
     moments /= moments[0] + (_SEARCH_MEAN @ moments[0] + _LEAST_WEIGHT)
     weight, first, second = moments
     second -= first * first / weight
-    (s0, s1, s2), (r0, r1, _), (variance, _, _) = _SEARCH_ALONG @ moments
-    offset, slope = _solve(s0, s1, s2, r0, r1)
-    blur = np.sqrt(2 * variance / s0) * reach  # a squared Gaussian is narrower by the root of two
-    return edges.moved(offset * reach, slope * (reach / _SEARCH_SHARE)), blur
+    weight, first, second = _SEARCH_ALONG @ moments
+    blur = np.sqrt(2 * second[0] / weight[0]) * reach  # 2: a squared Gaussian is narrower
+    return frame[:2] + _solve(weight, first[:2]) * frame[2], blur
 
 
-def _measure(image: Grey, edges: _Edges, blur: Array, lens: PinholeCamera | None) -> _Edges:
-    """Measures edges that are known to a fraction of a pixel."""
+def _measure(
+    image: Grey, edges: _Edges, lines: Points, blur: Array, lens: PinholeCamera | None
+) -> Points:
+    """Measures edges that are known to a fraction of a pixel.
+
+    Args:
+        image: (height, width) grey.
+        edges: where they started.
+        lines: (2, 4n), as `_search` gives them, and returned like that.
+        blur: (4n,) standard deviations of the steps, px.
+        lens: of a distorted picture.
+    """
     blur = np.fmax(blur, _SHARP)
     reach = np.maximum(np.minimum(edges.cell - _CLEAR * blur, _WINDOW * blur), _NARROWEST)
     share = 1 - np.minimum((_CORNER + reach) / edges.length, _MOST_LEFT_OUT)
-    profiles = _profiles(image, edges, share, reach, _PLACES, lens)
-    area, contrast = (_AREA_AND_CONTRAST @ profiles.reshape(_SAMPLES, -1)).reshape(
-        2, -1, len(reach)
-    )
+    frame = np.array([lines[0], lines[1] * (share / _SEARCH_SHARE), edges.normal * reach])
+    profiles = _profiles(image, frame, _PLACES, lens)
+    sums = (_AREA_AND_CONTRAST @ profiles.reshape(_SAMPLES, -1)).reshape(2, _LINES, -1)
+    area, contrast = sums
     mean = np.maximum(_MEAN @ contrast, 1.0)
     place = area / mean
-    # Outliers count less, and scan lines that meet no step not at all: hidden ones, and those
-    # beyond the rim, where the picture goes on as its last pixel.
-    residual = np.abs(place - _LINE @ (_PLAIN_FIT @ place))
-    ratio = residual / (2 * (_MEAN @ residual) + _TOLERANCE)
-    ratio *= ratio
-    ratio *= ratio
-    weight = (contrast > 0.5 * mean) / (1 + ratio)
-    offset, slope = _solve(*(_ALONG @ weight), *(_ALONG[:2] @ (weight * place)))
-    trusted = reach * (np.abs(offset) + np.abs(slope) < 1)
-    return edges.moved(offset * trusted, slope * trusted / share)
+    solution = _PLAIN_FIT @ place
+    residual = np.abs(place - _LINE @ solution)
+    if residual.max() > _TOLERANCE:
+        # Once more with outliers weighted down, and without the scan lines that meet no step:
+        # hidden ones, and those beyond the rim, where the picture goes on as its last pixel.
+        ratio = residual / (2 * (_MEAN @ residual) + _TOLERANCE / 2)
+        ratio *= ratio
+        ratio *= ratio
+        weight = (contrast > 0.5 * mean) / (1 + ratio)
+        solution = _solve(_ALONG @ weight, _ALONG[:2] @ (weight * place))
+    trusted = np.abs(solution).max(axis=0) < 1
+    return frame[:2] + solution * (frame[2] * trusted)
 
 
 def _profiles(
-    image: Grey,
-    edges: _Edges,
-    share: Array,
-    reach: Array,
-    places: NDArray[np.float32],
-    lens: PinholeCamera | None,
+    image: Grey, frame: Points, places: NDArray[np.float32], lens: PinholeCamera | None
 ) -> NDArray[np.float32]:
     """Samples scan lines across edges.
 
     Args:
         image: (height, width) grey.
-        edges: where to.
-        share: (4n,) how much of each edge is scanned.
-        reach: (4n,) half the length of a scan line, px.
-        places: (samples, lines, 3) in the edges' own coordinates (see `_places`).
+        frame: (3, 4n) a point of each edge, a vector along it and one across.
+        places: (samples, lines, 3) of the samples in such a frame (see `_places`).
         lens: of a distorted picture.
 
     Returns:
         (samples, lines, 4n) grey levels.
     """
-    frame = np.array([edges.middle, edges.half * share, edges.normal * reach], np.complex64)
-    xy = places.reshape(-1, 3) @ frame.view(np.float32)  # columns: x and y in turn
+    # One product lays out all the maps; its columns are x and y in turn.
+    xy = places.reshape(-1, 3) @ frame.astype(np.complex64).view(np.float32)
     if lens is not None:
         ideal = xy.view(np.complex64).astype(np.complex128)
         xy = to_picture(ideal, lens).astype(np.complex64).view(np.float32)
-    # The map's shape has no meaning, but OpenCV takes no more than 32767 rows or columns.
-    xy = xy.reshape(len(reach), -1, 2)
+    # Their shape has no meaning, but OpenCV takes no more than 32767 rows or columns.
+    xy = xy.reshape(frame.shape[1], -1, 2)
     samples = cv2.remap(image, xy, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return samples.astype(np.float32).reshape(*places.shape[:2], -1)
 
 
-def _solve(s0: Array, s1: Array, s2: Array, r0: Array, r1: Array) -> tuple[Array, Array]:
-    """Solves the normal equations of r = offset + slope u; zeros where nothing has weight.
+def _solve(weights: Array, values: Array) -> Array:
+    """Fits value = offset + slope u by weighted least squares.
 
     Args:
-        s0: sum of the weights; with u, s1; with its square, s2.
-        r0: sum of the weighted r; with u, r1.
+        weights: (3, edges) sums of the weights times u to the powers 0, 1, 2.
+        values: (2, edges) sums of the weighted values times u to the powers 0, 1.
+
+    Returns:
+        (2, edges) offset and slope; zero where nothing has weight.
     """
-    determinant = s0 * s2 - s1 * s1 + _LEAST_WEIGHT
-    return (s2 * r0 - s1 * r1) / determinant, (s0 * r1 - s1 * r0) / determinant
+    determinant = weights[0] * weights[2] - weights[1] * weights[1] + _LEAST_WEIGHT
+    return (weights[2::-2] * values - weights[1] * values[::-1]) / determinant
 
 
-def _intersections(edges: _Edges) -> Points:
-    """Returns the corners, (n, 4): where each edge meets the one before it."""
-    point, direction = edges.middle.reshape(-1, 4), edges.half.reshape(-1, 4)
+def _intersections(lines: Points) -> Points:
+    """Returns the corners, (n, 4): where each edge's line meets the one before it."""
+    point, direction = lines.reshape(2, -1, 4)
     along = direction.take(_PREVIOUS, axis=1).conj()
     apart = point.take(_PREVIOUS, axis=1) - point
     return point + direction * ((along * apart).imag / (along * direction).imag)

@@ -65,9 +65,7 @@ class Family:
     def check_id(self, marker_id: int) -> None:
         """Raises `ValueError` when the family has no such id."""
         if not 0 <= marker_id < self.count:
-            raise ValueError(
-                f"id is {marker_id}: {self.name} has the ids 0 to {self.count - 1}"
-            )
+            raise ValueError(f"id is {marker_id}: {self.name} has the ids 0 to {self.count - 1}")
 
     def cell_image(self, marker_id: int, margin: int = 1) -> NDArray[np.uint8]:
         """Returns the official upright image, one pixel a cell.

@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.math import RigidTransform, RotationMatrix
+
 from systems.markers.family import Family, family
 from systems.validation import nearest
 
@@ -188,7 +188,9 @@ def _check_keys(content: Any, where: str, needed: set[str], optional: set[str]) 
         raise ValueError(f"{where} is {content!r}: must be an object with {sorted(needed)}")
     for key in content:
         if key not in needed | optional:
-            raise ValueError(f"{where} has the unknown key {key!r}: {nearest(key, needed | optional)}")
+            raise ValueError(
+                f"{where} has the unknown key {key!r}: {nearest(key, needed | optional)}"
+            )
     for key in sorted(needed - set(content)):
         raise ValueError(f"{where} lacks the key {key!r}")
 

@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+
 from systems.cameras import PinholeCamera
 from systems.health import Counts
 from systems.markers.layout import MarkerMap
@@ -150,9 +150,7 @@ class MapLocalizer:
         """Solves the body's pose from one picture's detections; never NaN, never an exception."""
         dropped = dict.fromkeys(REASONS, 0)
         seen = self._usable(detections, dropped)
-        nothing = PoseEstimate(
-            frame_id=self.marker_map.frame, child_frame_id=self.body_frame
-        )
+        nothing = PoseEstimate(frame_id=self.marker_map.frame, child_frame_id=self.body_frame)
         if len(seen) == 0:
             return Localization(nothing, nothing, dropped)
         rays, by_ray = self.camera.rays(seen.corners)
@@ -186,9 +184,7 @@ class MapLocalizer:
             for k in range(len(solutions))
             if rms[k] <= self.parameters.max_reprojection
         ]
-        return Localization(
-            estimates[0], estimates[1] if len(estimates) > 1 else nothing, dropped
-        )
+        return Localization(estimates[0], estimates[1] if len(estimates) > 1 else nothing, dropped)
 
     def _usable(self, detections: Detections, dropped: dict[str, int]) -> Detections:
         """Returns the detections of markers that the map knows, counting the others."""
@@ -210,9 +206,7 @@ class MapLocalizer:
             seen = seen.select(np.array([int(np.argmax(_areas(seen.corners)))]))
         return seen
 
-    def _candidates(
-        self, R_CM: Array, p_CM: Array, index: NDArray[np.intp]
-    ) -> tuple[Array, Array]:
+    def _candidates(self, R_CM: Array, p_CM: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
         """Returns `X_CW` by each marker's two poses: (2n, 3, 3) and (2n, 3)."""
         R_CW = R_CM @ self._R_MW[index][:, None]
         p_CW = p_CM - (R_CW @ self._p_WM[index][:, None, :, None])[..., 0]

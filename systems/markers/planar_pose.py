@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 SAME_POSE = 0.02  # rad; minima nearer to each other than this are one
 
+
 @dataclass(frozen=True, eq=False)
 class PlanarPoses:
     """Two poses of each of n markers in the optical frame, the better one first.
@@ -181,7 +182,8 @@ def closed_form(rays: Array, sizes: Array) -> tuple[NDArray[np.bool_], Array, Ar
     """
     with np.errstate(all="ignore"):
         H = homography_of_square(rays)
-        good = np.isfinite(H).all(axis=(1, 2)) & (_twice_signed_areas(rays) > 0).all(axis=1)
+        good: NDArray[np.bool_] = np.isfinite(H).all(axis=(1, 2))
+        good &= (_twice_signed_areas(rays) > 0).all(axis=1)
     if not good.any():
         return good, np.zeros((0, 2, 3, 3)), np.zeros((0, 2, 3))
     # The homography's plane has axes (right, up); a marker's are y and z, its normal is x.
@@ -229,8 +231,10 @@ def _better_first(solution: PnpSolution) -> tuple[Array, Array, Array, Array]:
 
 
 def _twice_signed_areas(corners: Array) -> Array:
-    """Returns (n, 4) the signed area at each corner: all positive for a convex marker seen from
-    the front (clockwise in the picture, where y points down).
+    """Returns (n, 4) the signed area at each corner.
+
+    All are positive for a convex marker seen from the front: clockwise in the picture, where y
+    points down.
     """
     ahead = np.roll(corners, -1, axis=1) - corners
     behind = np.roll(corners, 1, axis=1) - corners

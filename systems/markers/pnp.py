@@ -16,7 +16,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-
 Array = NDArray[np.float64]
 
 _DAMPING_START = 1e-6  # of the normal matrix' diagonal
@@ -156,7 +155,7 @@ def refine(
         damped[:, diagonal, diagonal] *= 1 + damping[:, None]
         if not active.all():
             damped[~active] = np.eye(6)
-        step = -np.linalg.solve(damped, g[..., None])[..., 0]
+        step: Array = -np.linalg.solve(damped, g[..., None])[..., 0]
         R_new = rotation_from_vector(step[:, :3]) @ R
         p_new = p + step[:, 3:]
         error_new, H_new, g_new = _normal_equations(R_new, p_new, points, rays, by_ray)

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+
 from systems.validation import require, require_positive
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import (
     ClippingRange,
@@ -16,6 +15,7 @@ from pydrake.geometry import (
 )
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, InputPort, OutputPort
+
 from systems.cameras import PinholeCamera
 from systems.image_effects import ImageEffects, Lens, expose
 from systems.markers.pnp import rotation_from_vector

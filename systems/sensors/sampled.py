@@ -7,6 +7,7 @@ from typing import Any
 
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, EventStatus, LeafSystem, OutputPort, State
+
 from systems.messages import Message, whole_nanoseconds
 from systems.noise import sample_index
 from systems.validation import require_non_negative, require_positive

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import textwrap
+import zlib
 from io import BytesIO
 from pathlib import Path
 
@@ -243,6 +244,16 @@ def test_the_metadata_says_what_ros_2_wants(tmp_path):
     assert (latched["durability"], latched["reliability"]) == (1, 1)  # rmw's numbers
 
 
+def test_the_checksum_of_the_summary_is_right(tmp_path):
+    write_run(tmp_path / "bag")
+    data = (tmp_path / "bag" / "bag_0.mcap").read_bytes()
+    # The footer's record: opcode, length, start of the summary, of its offsets, checksum; magic.
+    footer = data[-37:]
+    assert footer[0] == 2
+    start = int.from_bytes(footer[9:17], "little")
+    assert int.from_bytes(footer[25:29], "little") == zlib.crc32(data[start:-12])
+
+
 def test_two_equal_runs_give_equal_bytes(tmp_path):
     write_run(tmp_path / "one" / "bag")
     write_run(tmp_path / "two" / "bag")
@@ -308,6 +319,27 @@ def test_a_killed_process_leaves_all_but_the_last_second(tmp_path, moment):
     assert len(read) % 100 == 0
     for k, (topic, t, message) in enumerate(read):
         assert (topic, t, message.linear_acceleration.z) == ("/imu", k / 100, float(k))
+
+
+def test_a_process_killed_while_it_writes_loses_that_chunk_only(tmp_path):
+    """The next chunk is written over the old index: any part of it may have got to the disk."""
+    path = tmp_path / "bag" / "bag_0.mcap"
+    written, writer = write_run(tmp_path / "bag", seconds=2.5, close=False)
+    before = path.read_bytes()
+    writer.flush()
+    after = path.read_bytes()
+    writer.close()
+    end = next(i for i, (a, b) in enumerate(zip(before, after, strict=False)) if a != b)
+    first_two = [entry for entry in written if entry[1] < 2.0]
+    torn = tmp_path / "torn.mcap"
+    rng = np.random.default_rng(0)
+    for reached in [end + 1, *rng.integers(end, len(after), 40).tolist()]:
+        torn.write_bytes(after[:reached] + before[reached:])
+        reader = BagReader(torn)
+        read = list(reader.messages())
+        assert len(read) in (len(first_two), len(written))
+        assert_same(read, written[: len(read)])
+        assert reader.truncated
 
 
 # Cut off

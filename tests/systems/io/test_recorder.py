@@ -87,6 +87,8 @@ def record(folder, channels, duration, static=None):
         source = channel.port.split("_")[0]
         builder.Connect(sensors.GetOutputPort(source), recorder.GetInputPort(channel.port))
     simulator = Simulator(builder.Build())
+    simulator.Initialize()
+    simulator.Initialize()  # as it happens when a Context is changed before the start
     simulator.AdvanceTo(duration)
     recorder.close()
     return recorder
@@ -238,10 +240,9 @@ def test_a_full_disk_is_said_once_and_the_simulation_goes_on(tmp_path):
     )
     assert result.returncode == 0, result.stderr
     assert result.stdout.split() == ["9.505", "651"]  # 3.00 to 9.50 s
-    first, *others = result.stderr.splitlines()
-    assert first.startswith("recording at 4.000 s of the simulation: [Errno 27] File too large")
-    assert "bag_0.mcap" in first
-    assert [line.split(":")[0] for line in others] == ["recording stopped"]
+    [line] = result.stderr.splitlines()
+    assert line.startswith("recording at 4.000 s of the simulation: [Errno 27] File too large")
+    assert "bag_0.mcap" in line
     read = list(BagReader(tmp_path / "bag").messages())
     assert [t for _, t, _ in read] == [k / 100 for k in range(300)]
 
