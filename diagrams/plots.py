@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -45,7 +45,7 @@ def plot_navigation(
     """
     figure = Figure(figsize=(12.0, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
-    left, right = np.ravel(figure.subfigures(1, 2, width_ratios=[1.0, 1.05]))
+    left, right = cast(NDArray[Any], figure.subfigures(1, 2, width_ratios=[1.0, 1.05]))
     _plan(left.subplots(), log, waypoints, radius, walls, markers)
     axes = right.subplots(4 if log.truth is not None else 3, 1, sharex=True)
     if log.truth is None:

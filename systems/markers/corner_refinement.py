@@ -36,7 +36,7 @@ _MOST_LEFT_OUT = 0.5  # of half an edge, however short
 
 # The search for the step.
 _SEARCH_LINES = 12
-_SEARCH_SHARE = 0.88  # of an edge, away from its corners
+_SEARCH_SHARE = 0.9  # of an edge, away from its corners
 _SEARCH_SAMPLES = 13
 _SEARCH_RANGE = 3.0  # px either side
 _SEARCH_CELLS = (0.4, 1.3)  # it grows to the first share of a cell, and is never above the second

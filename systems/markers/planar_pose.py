@@ -182,7 +182,7 @@ def closed_form(rays: Array, sizes: Array) -> tuple[NDArray[np.bool_], Array, Ar
     """
     with np.errstate(all="ignore"):
         H = homography_of_square(rays)
-        good: NDArray[np.bool_] = np.isfinite(H).all(axis=(1, 2))
+        good = np.asarray(np.isfinite(H).all(axis=(1, 2)))
         good &= (_twice_signed_areas(rays) > 0).all(axis=1)
     if not good.any():
         return good, np.zeros((0, 2, 3, 3)), np.zeros((0, 2, 3))

@@ -155,7 +155,7 @@ def refine(
         damped[:, diagonal, diagonal] *= 1 + damping[:, None]
         if not active.all():
             damped[~active] = np.eye(6)
-        step: Array = -np.linalg.solve(damped, g[..., None])[..., 0]
+        step = np.asarray(-np.linalg.solve(damped, g[..., None])[..., 0], np.float64)
         R_new = rotation_from_vector(step[:, :3]) @ R
         p_new = p + step[:, 3:]
         error_new, H_new, g_new = _normal_equations(R_new, p_new, points, rays, by_ray)
