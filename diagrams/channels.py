@@ -67,6 +67,8 @@ class Signal:
     def player(self, reader: BagReader) -> tuple[MessagePlayback | VectorPlayback, float]:
         """Returns the block that plays the port from a recording, and the time of its end (s).
 
+        Times count from the recording's first message.
+
         Raises:
             ScenarioError: the recording lacks the topic.
         """
@@ -76,7 +78,7 @@ class Signal:
             raise ScenarioError(
                 f"recording {reader.path}: lacks the topic {self.topic}; has {have}"
             )
-        entries = read_channel(reader, self.topic, self.decode)
+        entries = read_channel(reader, self.topic, self.decode, origin=reader.start)
         end = entries[-1].log_time * 1e-9 if entries else 0.0
         if isinstance(self.model, int):
             return VectorPlayback(entries=entries, size=self.model), end

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import json
 import logging
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
-console = Console(highlight=False, soft_wrap=True)
+console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -21,18 +23,29 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format="tagtrail: %(message)s")
+    logging.getLogger("drake").setLevel(logging.WARNING)
     try:
         return int(options.function(options))
     except ValueError as error:
-        print(f"tagtrail: {error}", file=sys.stderr)
+        print(f"tagtrail: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except OSError as error:  # a file of the results that cannot be written
+        print(f"tagtrail: {error.filename}: {error.strerror}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
         print("tagtrail: interrupted", file=sys.stderr)
         return 1
 
 
+class _Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line; `--help` shows the usage."""
+
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"{self.prog}: {message} (see {self.prog} --help)\n")
+
+
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = _Parser(
         prog="tagtrail", description="Robots that find their way by fiducial markers, in Drake."
     )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -84,10 +97,10 @@ def _parser() -> argparse.ArgumentParser:
 def _list(_: argparse.Namespace) -> int:
     from diagrams.scenario import bundled_scenarios, read_layers
 
-    table = RichTable.grid(padding=(0, 2))
-    for name, path in bundled_scenarios().items():
-        table.add_row(name, str(read_layers(path).data.get("description", "")))
-    console.print(table)
+    bundled = bundled_scenarios()
+    width = max(map(len, bundled))
+    for name, path in bundled.items():
+        console.print(f"{name:{width}}  {read_layers(path).data.get('description', '')}")
     return 0
 
 
@@ -98,8 +111,8 @@ def _run(options: argparse.Namespace) -> int:
     overrides = list(options.set)
     given = {key: getattr(options, key) for key in ("seed", "duration")}
     overrides += [f"{key}={value}" for key, value in given.items() if value is not None]
-    if options.play:
-        overrides.append(f"recording={options.play}")
+    if options.play is not None:
+        overrides.append(f"recording={json.dumps(options.play)}")  # text, whatever YAML makes of it
     scenario = load_scenario(options.scenario, overrides)
     out = options.out or Path("out") / scenario.name
     meshcat = None if options.no_meshcat else start_meshcat()
@@ -128,11 +141,15 @@ def _diagram(options: argparse.Namespace) -> int:
 
 
 def _markers(options: argparse.Namespace) -> int:
-    from diagrams.schema import file_path
+    from diagrams.schema import ScenarioError, bundled_folder, file_path
     from systems.markers.layout import load_map
     from systems.markers.sheets import write_sheets
 
-    marker_map = load_map(file_path(options.map, "maps"))
+    path = file_path(options.map, "maps")
+    if not path.exists():
+        bundled = ", ".join(sorted(p.name for p in bundled_folder("maps").iterdir()))
+        raise ScenarioError(f"marker map {path}: no such file; bundled: {bundled}")
+    marker_map = load_map(path)
     write_sheets(marker_map, options.out, page=options.page)
     console.print(f"{options.out}: {len(marker_map)} markers; print at 100 %")
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,8 @@ from systems.markers.planar_pose import planar_poses
 from systems.messages import Detections
 from systems.validation import require_positive
 
+_log = logging.getLogger(__name__)
+
 MAX_PICTURES = 200  # annotated ones; the table has all
 
 
@@ -35,7 +38,7 @@ def detect(
     out: Path,
     progress: Callable[[float, float], None] | None = None,
 ) -> list[tuple[str, str, str]]:
-    """Finds markers and writes `detections.json` and annotated pictures into `out`.
+    """Finds markers and writes `detections.json` and annotated pictures (PNG) into `out`.
 
     `detections.json` is a list with one entry a marker: `image`, `stamp`, `id`, `corners` (4 x 2
     px, top-left first, clockwise, from the centre of the first pixel), `hamming`,
@@ -65,19 +68,23 @@ def detect(
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ScenarioError(f"--out {out}: {error.strerror}") from error
-    detector = MarkerDetector(family=kind, camera=given)
+    if _folder(out) == _folder(source):
+        raise ScenarioError(f"--out {out}: holds the pictures, which annotated ones would replace")
+    detectors: dict[PinholeCamera | None, MarkerDetector] = {}  # a recording may have many cameras
     rows: list[dict[str, Any]] = []
     summary: list[tuple[str, str, str]] = []
     for count, picture in enumerate(pictures(source)):
         model = given or picture.camera
         _check_size(model, picture, camera)
-        if detector.camera is None and model is not None:
-            detector = MarkerDetector(family=kind, camera=model)
-        found = detector.detect(picture.image, picture.stamp)
+        if size is not None and model is None and count == 0:
+            _log.warning(f"no poses: no --camera is given, and {picture.name} brings none")
+        if model not in detectors:
+            detectors[model] = MarkerDetector(family=kind, camera=model)
+        found = detectors[model].detect(picture.image, picture.stamp)
         rows += _rows(picture, found, size, model)
         summary.append((picture.name, str(len(found)), " ".join(map(str, sorted(found.ids)))))
         if count < MAX_PICTURES:
-            _write_picture(out / f"{Path(picture.name).stem}.png", annotate(picture.image, found))
+            _write_picture(out / _as_png(picture.name), annotate(picture.image, found))
         if progress is not None:
             progress(count + 1, math.inf)
     lines = ",\n".join(json.dumps(row) for row in rows)  # a marker a line
@@ -153,6 +160,16 @@ def _rows(
             if np.isfinite(rms[k, s])
         ]
     return rows
+
+
+def _folder(path: Path) -> Path:
+    """Returns the folder that a path is, or lies in."""
+    return (path if path.is_dir() else path.parent).resolve()
+
+
+def _as_png(name: str) -> str:
+    """Returns a picture's name as that of a PNG; those of a.jpg and a.png differ."""
+    return name if name.endswith(".png") else f"{name}.png"
 
 
 def _quaternion(R: NDArray[np.float64]) -> list[float]:

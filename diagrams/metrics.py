@@ -42,8 +42,17 @@ class PoseLog:
 
 
 def nees(errors: Array, covariance: Array) -> Array:
-    """Returns (n,) normalised estimation error squared, e' P^-1 e, of errors (n, d)."""
-    return np.einsum("ni,ni->n", errors, np.linalg.solve(covariance, errors[..., None])[..., 0])
+    """Returns (n,) normalised estimation error squared, e' P^-1 e, of errors (n, d).
+
+    Infinite where a covariance (n, d, d) is singular: whoever claims to be certain.
+    """
+    regular = np.linalg.det(covariance) > 0
+    values = np.full(len(errors), np.inf)
+    e = errors[regular]
+    values[regular] = np.einsum(
+        "ni,ni->n", e, np.linalg.solve(covariance[regular], e[..., None])[..., 0]
+    )
+    return values
 
 
 def path_length(positions: Array) -> float:

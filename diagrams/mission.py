@@ -104,8 +104,16 @@ class Wiring:
         return True
 
     def connect(self, source: str, target: str) -> None:
-        """Connects two ports by name."""
-        self.builder.Connect(self.output(source), self.input(target))
+        """Connects two ports by name.
+
+        Raises:
+            ScenarioError: there is no such port, or they carry different things.
+        """
+        output, port = self.output(source), self.input(target)
+        try:
+            self.builder.Connect(output, port)
+        except RuntimeError as error:
+            raise ScenarioError(f"{source} does not fit {target}: {error}") from error
 
     def connect_if_wanted(self, source: str, target: str) -> None:
         """Connects two ports if the target block, a user's perhaps, has that input at all."""
@@ -126,13 +134,21 @@ class Wiring:
     def add_recorder(self, out: Path | None) -> Recorder | None:
         """Adds the recorder of all signals, if the scenario wants a recording.
 
-        The recorder looks at every signal at the rate of the fastest: see `Signal.channel`.
+        The recorder looks at every signal at the rate of the fastest: see `Signal.channel`. The
+        recording of an earlier run in the same folder is replaced.
 
         Raises:
-            ValueError: the folder cannot be written.
+            ValueError: the folder cannot be written, or holds the recording that is played.
         """
         wanted = self._scenario.record
-        if out is None or not wanted.bag:
+        if out is None:
+            return None
+        played = self._scenario.recording
+        if played and Path(played).is_relative_to((out / "bag").resolve()):
+            raise ScenarioError(f"--out {out}: holds the recording that is played")
+        for name in ("bag_0.mcap", "metadata.yaml"):
+            (out / "bag" / name).unlink(missing_ok=True)
+        if not wanted.bag:
             return None
         signals = [s for s in self._signals if wanted.images or not s.port.endswith(".image")]
         rate = max(signal.rate for signal in signals)

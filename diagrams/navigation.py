@@ -34,7 +34,11 @@ from systems.planners.waypoint_sequencer import WaypointSequencer
 from systems.validation import require, require_positive
 
 ESTIMATORS = Table("estimator", {"kf": "systems.estimators.planar_kalman:PlanarKalmanFilter"})
-CONTROLLERS = Table("controller", {"waypoint": "systems.controllers.waypoints:WaypointController"})
+CONTROLLERS = Table(
+    "controller",
+    {"waypoint": "systems.controllers.waypoints:WaypointController"},
+    resources=frozenset({"waypoints"}),
+)
 
 ROBOT = "robot"
 
@@ -79,10 +83,15 @@ class NavigationScenario(Scenario):
                 point,
                 "[x, y] in metres",
             )
-        for key in ("camera", "imu"):
+        for key, method in (("camera", "mounting"), ("imu", "add")):
             name = getattr(self, key)
-            have = ", ".join(self.robot.sensors) or "none"
-            require(name in self.robot.sensors, key, name, f"one of the robot's sensors: {have}")
+            fit = [n for n, s in self.robot.sensors.items() if hasattr(s.target, method)]
+            have = ", ".join(fit) or "none"
+            require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
+        room = self.robot.body.build().hull_radius
+        check_free(self.world.arena, np.array(self.waypoints), room, "waypoints")
+        start = self.robot.start
+        check_free(self.world.arena, np.array([[start.x, start.y]]), room, "robot.start")
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:
         """Wires station, estimator and controller.
@@ -94,10 +103,6 @@ class NavigationScenario(Scenario):
         Raises:
             ValueError: something of the scenario is refused; one line.
         """
-        room = self.robot.body.build().hull_radius
-        check_free(self.world.arena, np.array(self.waypoints), room, "waypoints")
-        start = self.robot.start
-        check_free(self.world.arena, np.array([[start.x, start.y]]), room, "robot.start")
         return NavigationMission(self, meshcat=meshcat, out=out)
 
 

@@ -17,6 +17,16 @@ from pydrake.systems.framework import Context
 
 from diagrams.mission import FRAME_RATE, Mission
 from diagrams.scenario import Scenario, save_scenario
+from systems.validation import require_non_negative
+
+RESULTS = (
+    "report.json",
+    "summary.png",
+    "replay.html",
+    "scenario.yaml",
+    "estimate.tum",
+    "truth.tum",
+)
 
 _MAX_STEP = 0.01  # s, of the integrator; only kinematic twins have continuous state
 
@@ -50,7 +60,7 @@ def simulate(
 
     Args:
         scenario: as `load_scenario` gives it.
-        out: folder of the results; None writes nothing.
+        out: folder of the results; None writes nothing. An earlier run's results are replaced.
         meshcat: where it is shown; its replay is written too.
         realtime: slows the simulation down to this many times real time; 0 is as fast as it goes.
         progress: called with the simulated time and the duration, s.
@@ -58,12 +68,16 @@ def simulate(
     Raises:
         ValueError: the scenario or a file that it names is refused.
     """
+    require_non_negative(realtime=realtime)
     if out is not None:
         _make_folder(out)
-        save_scenario(scenario, out / "scenario.yaml")
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=FRAME_RATE)
     mission: Mission = scenario.build(meshcat=meshcat, out=out)
+    if out is not None:  # from here on the folder is this run's
+        for name in RESULTS:
+            (out / name).unlink(missing_ok=True)
+        save_scenario(scenario, out / "scenario.yaml")
     try:
         outcome, context, wall = _advance(scenario, mission, realtime, progress)
     finally:

@@ -2,7 +2,7 @@
 
 Later layers override earlier ones: the defaults of the dataclasses, the file that `extends` names,
 the file, `--set KEY=VALUE`. Mappings are merged key by key; everything else is replaced. A block
-whose `type` changes starts anew, and a word overrides a block's type alone.
+whose `type` changes starts anew; a word overrides a block's type alone.
 """
 
 from __future__ import annotations
@@ -15,11 +15,23 @@ from typing import Annotated, Any, Literal
 
 from ruamel.yaml import YAML, YAMLError
 
-from diagrams.schema import Existing, Key, Place, ScenarioError, bundled_folder, convert, to_plain
+from diagrams.schema import (
+    OVERRIDE,
+    Existing,
+    Implied,
+    Key,
+    Place,
+    ScenarioError,
+    bundled_folder,
+    convert,
+    to_plain,
+)
 from diagrams.tables import Table
 from systems.validation import nearest, require, require_positive
 
-MISSIONS = Table("mission", {"navigation": "diagrams.navigation:NavigationScenario"})
+MISSIONS = Table(
+    "mission", {"navigation": "diagrams.navigation:NavigationScenario"}, method="build"
+)
 
 
 @dataclass
@@ -85,7 +97,7 @@ class Layers:
 
     def place(self) -> Place:
         """Returns the place of the top."""
-        return Place(origins=self.origins, folders=(*self.folders, Path()))
+        return Place(origins=self.origins, folders=tuple(self.folders))
 
 
 def bundled_scenarios() -> dict[str, Path]:
@@ -150,8 +162,8 @@ def check(layers: Layers) -> Any:
         raise place.error("the scenario lacks the key 'mission'")
     mission = convert(layers.data["mission"], str, place / "mission")
     # The mission's scenario class says which other keys there are.
-    target = MISSIONS.target(mission, place / "mission")
-    return convert(layers.data, target, place)
+    name, target = MISSIONS.target(mission, place / "mission")
+    return convert(layers.data | {"mission": name}, target, place)
 
 
 def read_layers(path: Path, seen: tuple[Path, ...] = ()) -> Layers:
@@ -181,10 +193,14 @@ def read_layers(path: Path, seen: tuple[Path, ...] = ()) -> Layers:
     if base is not None:
         if not isinstance(base, str):
             raise ScenarioError(f"{path}: extends is {base!r}: must be a name or path")
-        layers = read_layers(find_scenario(base, [path.parent]), (*seen, resolved))
+        try:
+            extended = find_scenario(base, [path.parent])
+        except ScenarioError as error:
+            raise ScenarioError(f"{path}: extends: {error}") from error
+        layers = read_layers(extended, (*seen, resolved))
     layers.folders.insert(0, path.parent)
-    origins: dict[Key, str] = {}
-    _note_origins(content, (), str(path), origins)
+    origins: dict[Key, str] = {(): str(path)}
+    _note_lines(content, (), str(path), origins)
     layers.data = merge(layers.data, to_plain(content))
     layers.origins |= origins
     return layers
@@ -195,7 +211,7 @@ def merge(base: Any, top: Any) -> Any:
     if isinstance(base, Mapping) and isinstance(top, str) and "type" in base:
         return dict(base) if base["type"] == top else {"type": top}
     if isinstance(base, str) and isinstance(top, Mapping) and top.get("type", base) == base:
-        base = {"type": base}
+        base = {"type": Implied(base)}
     if not isinstance(base, Mapping) or not isinstance(top, Mapping):
         return top
     if "type" in top and top["type"] != base.get("type", top["type"]):
@@ -241,18 +257,29 @@ def _flow(data: Any) -> Any:
     return data
 
 
-def _note_origins(content: Any, key: Key, file: str, origins: dict[Key, str]) -> None:
+def _note_lines(content: Any, key: Key, file: str, origins: dict[Key, str]) -> None:
     """Notes the line of every key; ruamel keeps lines beside its mappings and sequences."""
     if isinstance(content, dict):
         for name, value in content.items():
-            line = content.lc.key(name)[0]  # type: ignore[attr-defined]
-            origins[(*key, str(name))] = f"{file}:{line + 1}"
-            _note_origins(value, (*key, str(name)), file, origins)
+            # A key that YAML's merge key `<<` brought has no line of its own.
+            if position := (content.lc.data or {}).get(name):  # type: ignore[attr-defined]
+                origins[(*key, str(name))] = f"{file}:{position[0] + 1}"
+            _note_lines(value, (*key, str(name)), file, origins)
     elif isinstance(content, list):
         for index, value in enumerate(content):
             line = content.lc.item(index)[0]  # type: ignore[attr-defined]
             origins[(*key, index)] = f"{file}:{line + 1}"
-            _note_origins(value, (*key, index), file, origins)
+            _note_lines(value, (*key, index), file, origins)
+
+
+def _note_override(value: Any, key: Key, text: str, origins: dict[Key, str]) -> None:
+    """Notes an override as the origin of its key and of all that its value holds."""
+    origins[key] = text
+    inner = value if isinstance(value, Mapping) else {}
+    if isinstance(value, list):
+        inner = dict(enumerate(value))
+    for step, item in inner.items():
+        _note_override(item, (*key, step), text, origins)
 
 
 def _parse_override(text: str) -> tuple[str, Any]:
@@ -265,8 +292,11 @@ def _parse_override(text: str) -> tuple[str, Any]:
 def _set(layers: Layers, dotted: str, value: Any) -> None:
     """Lays one override over the data; numbers in the key are indices of lists."""
     steps: list[str | int] = [int(s) if s.isdigit() else s for s in dotted.split(".")]
-    layers.origins[tuple(steps)] = f"--set {dotted}"
-    layers.data = _set_in(layers.data, steps, value, f"--set {dotted}")
+    text = f"{OVERRIDE}{dotted}"
+    for depth in range(1, len(steps)):
+        layers.origins.setdefault(tuple(steps[:depth]), text)
+    _note_override(value, tuple(steps), text, layers.origins)
+    layers.data = _set_in(layers.data, steps, value, text)
 
 
 def _set_in(data: Any, steps: list[str | int], value: Any, what: str) -> Any:
@@ -277,11 +307,6 @@ def _set_in(data: Any, steps: list[str | int], value: Any, what: str) -> Any:
         if not isinstance(step, int) or not 0 <= step < len(data):
             raise ScenarioError(f"{what}: {step!r} must be an index from 0 to {len(data) - 1}")
         return [_set_in(v, rest, value, what) if i == step else v for i, v in enumerate(data)]
-    if isinstance(data, str) and rest == [] and step != "type":
-        data = {"type": data}  # a block written as a word
-    if data is None:
-        data = {}
-    if not isinstance(data, dict):
-        raise ScenarioError(f"{what}: there is no {step!r} in {data!r}")
     key = str(step)
-    return data | {key: _set_in(data.get(key), rest, value, what)}
+    inner = _set_in(data.get(key) if isinstance(data, Mapping) else None, rest, value, what)
+    return merge(data, {key: inner})

@@ -8,6 +8,7 @@ Drake's `yaml_load_typed` name no path, and it takes no raw blocks).
 from __future__ import annotations
 
 import dataclasses
+import re
 import types
 import typing
 from collections.abc import Mapping
@@ -18,6 +19,8 @@ from typing import Any, Literal
 from systems.validation import nearest
 
 Key = tuple[str | int, ...]
+
+OVERRIDE = "--set "  # begins the origin of what no file says
 
 
 class ScenarioError(ValueError):
@@ -46,7 +49,7 @@ class Existing:
             ScenarioError: there is nothing at the path.
         """
         name = convert(value, str, place)
-        for folder in place.folders:
+        for folder in place.search_path():
             if (folder / name).exists():
                 return str((folder / name).resolve())
         raise place.error(f"{place} is {name!r}: there is no such file or folder")
@@ -58,7 +61,7 @@ class Place:
 
     Attributes:
         key: the path from the top.
-        origins: key path to "file:line" or "--set ...".
+        origins: key path to "file:line" or "--set KEY".
         folders: folders of the scenario files, the last layer's first.
     """
 
@@ -75,16 +78,33 @@ class Place:
             text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step
         return text or "the scenario"
 
-    def error(self, message: str) -> ScenarioError:
-        """Returns the error, with the nearest known origin of this place before it."""
+    def origin(self) -> str:
+        """Returns where this place, or what it stands in, was written; "" when nobody wrote it."""
         for depth in range(len(self.key), -1, -1):
             if origin := self.origins.get(self.key[:depth]):
-                return ScenarioError(f"{origin}: {message}")
-        return ScenarioError(message)
+                return origin
+        return ""
+
+    def search_path(self) -> tuple[Path, ...]:
+        """Returns the folders that a relative path written here may start from.
+
+        In a file that is the file's folder, not whatever folder the command is run in.
+        """
+        here = () if self.folders and not self.origin().startswith(OVERRIDE) else (Path(),)
+        return (*here, *self.folders)
+
+    def error(self, message: str) -> ScenarioError:
+        """Returns the error, with the origin of this place before it."""
+        origin = self.origin()
+        return ScenarioError(f"{origin}: {message}" if origin else message)
 
     def expected(self, value: Any, allowed: str) -> ScenarioError:
         """Returns the error of a value that is not what is `allowed`."""
         return self.error(f"{self} is {value!r}: must be {allowed}")
+
+
+class Implied(str):
+    """The word that a mapping was laid over: a block keeps it as its type, all else forgets it."""
 
 
 def bundled_folder(name: str) -> Path:
@@ -139,7 +159,7 @@ def _scalar(value: Any, hint: Any, place: Place) -> Any:
         return value
     if hint in (bool, str) and isinstance(value, hint):
         return value
-    names = {float: "a number", int: "a whole number", bool: "true or false", str: "a word"}
+    names = {float: "a number", int: "a whole number", bool: "true or false", str: "text"}
     raise place.expected(value, names.get(hint, str(hint)))
 
 
@@ -169,14 +189,15 @@ def _annotated(value: Any, hint: Any, place: Place) -> Any:
 
 def _file(name: str, note: File, place: Place) -> str:
     """Returns a bundled file's bare name, or another file's absolute path."""
-    for folder in place.folders:
+    folders = place.search_path()
+    for folder in folders:
         if (folder / name).is_file():
             return str((folder / name).resolve())
     bundled = bundled_folder(note.folder)
     if (bundled / name).is_file():
         return name
     have = sorted(path.name for path in bundled.iterdir())
-    where = " or ".join(str(folder) for folder in place.folders) or "the current folder"
+    where = " or ".join(str(folder) for folder in folders)
     raise place.error(f"{place} is {name!r}: no such file in {where}; bundled: {', '.join(have)}")
 
 
@@ -187,9 +208,10 @@ def file_path(name: str, folder: str) -> Path:
 
 
 def _dataclass(value: Any, cls: type, place: Place) -> Any:
-    if not isinstance(value, Mapping):
-        raise place.expected(value, "a mapping with " + ", ".join(field_hints(cls)))
     hints = field_hints(cls)
+    if not isinstance(value, Mapping):
+        raise place.expected(value, "a mapping with " + ", ".join(hints))
+    value = {key: v for key, v in value.items() if not isinstance(v, Implied)}
     check_keys(value, hints, place)
     arguments = {key: convert(v, hints[key], place / key) for key, v in value.items()}
     for field in dataclasses.fields(cls):
@@ -202,13 +224,24 @@ def _dataclass(value: Any, cls: type, place: Place) -> Any:
 
 
 def construct(target: Any, arguments: Mapping[str, Any], place: Place) -> Any:
-    """Calls a constructor; a `ValueError` of its own gets the place in front."""
+    """Calls a constructor; a `ValueError` of its own gets the place in front.
+
+    The message of such an error begins with the argument ("gate is -1", "waypoints[2] is ..."), so
+    the place is that argument's.
+    """
     try:
         return target(**arguments)
     except ScenarioError:
         raise
     except ValueError as error:
-        raise place.error(f"{place}: {error}" if place.key else str(error)) from error
+        name, *indices = re.findall(r"\w+", str(error).split(" ")[0]) or [""]
+        within = name in arguments
+        prefix = f"{place}{'.' if within else ': '}" if place.key else ""
+        if within:
+            place /= name
+            for index in indices:
+                place /= int(index) if index.isdigit() else index
+        raise place.error(f"{prefix}{error}") from error
 
 
 def field_hints(cls: type) -> dict[str, Any]:
@@ -224,6 +257,15 @@ def check_keys(value: Mapping[str, Any], known: Mapping[str, Any], place: Place)
             raise (place / str(key)).error(
                 f"{place / str(key)}: unknown key; {nearest(str(key), known)}"
             )
+
+
+def is_plain(value: Any) -> bool:
+    """Whether a scenario file can hold a value."""
+    if dataclasses.is_dataclass(value) or isinstance(value, Mapping):
+        return True
+    if isinstance(value, list | tuple):
+        return all(map(is_plain, value))
+    return value is None or isinstance(value, bool | int | float | str)
 
 
 def to_plain(value: Any) -> Any:

@@ -9,6 +9,7 @@ of one) adds ports under `truth.`; nothing on the robot's side reads those.
 from __future__ import annotations
 
 import math
+import re
 import typing
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -32,18 +33,26 @@ from plants.body_state import TwinPositions
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap, load_map
-from systems.validation import require
+from systems.validation import require, require_non_negative, require_positive
 
 if typing.TYPE_CHECKING:
     from diagrams.drivers.body import DifferentialDriveBody
     from systems.io.bag import BagReader
 
-BODIES = Table("body", {"differential_drive": "diagrams.drivers.body:DifferentialDriveBody"})
-DRIVES = Table("drive", {"wheel_servo": "diagrams.drivers.drive:WheelServo"})
+BODIES = Table(
+    "body",
+    {"differential_drive": "diagrams.drivers.body:DifferentialDriveBody"},
+    method="add_model",
+)
+DRIVES = Table("drive", {"wheel_servo": "diagrams.drivers.drive:WheelServo"}, method="add")
 SENSORS = Table(
     "sensor",
     {"camera": "diagrams.drivers.camera:Camera", "imu": "diagrams.drivers.imu:InertialSensor"},
+    method="add",
 )
+
+# Names of blocks, ports and topics of a robot that its devices must leave free.
+_TAKEN = ("drive", "estimate", "servos", "state", "twin")
 
 RENDERER = "vtk"
 
@@ -71,6 +80,8 @@ class TagPlacement:
             self.position,
             "[x, y, z] in metres",
         )
+        require(math.isfinite(self.facing_deg), "facing_deg", self.facing_deg, "finite")
+        require_non_negative(size=self.size)
 
 
 @dataclass
@@ -87,8 +98,16 @@ class TagList:
     size: float
     tags: list[TagPlacement]
 
+    def __post_init__(self) -> None:
+        require_positive(size=self.size)
+        self.to_map()
+
     def to_map(self) -> MarkerMap:
-        """Returns the marker map."""
+        """Returns the marker map.
+
+        Raises:
+            ValueError: unknown family, an id twice or outside the family.
+        """
         kind = family(self.family)
         markers: dict[int, Marker] = {}
         for tag in self.tags:
@@ -132,6 +151,10 @@ class Start:
     y: float = 0.0
     heading_deg: float = 0.0
 
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            require(math.isfinite(value), name, value, "finite")
+
     def pose(self) -> np.ndarray:
         """Returns [x (m), y (m), theta (rad)]."""
         return np.array([self.x, self.y, math.radians(self.heading_deg)])
@@ -152,6 +175,15 @@ class RobotParameters:
     drive: Annotated[Choice, DRIVES]
     start: Start = field(default_factory=Start)
     sensors: dict[str, Annotated[Choice, SENSORS]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        for name in self.sensors:
+            require(
+                re.fullmatch("[a-z][a-z0-9_]*", name) is not None and name not in _TAKEN,
+                "sensors",
+                name,
+                f"a name in lower case, as ROS takes them, other than {', '.join(_TAKEN)}",
+            )
 
 
 @dataclass

@@ -7,15 +7,17 @@ A block of a scenario is a word or a mapping with the key `type`:
     estimator: {type: "my_package.filters:MyFilter", horizon: 3}
 
 A name is looked up in the table; `module:Class` names anything that can be imported, so a new
-algorithm is a new file and no edit here. The other keys are the constructor's keyword arguments; an
-argument named `parameters` that is a dataclass is written flat. What the diagram provides (the
-waypoints, the camera, ...) is handed to constructor arguments of that name.
+algorithm is a new file and no edit here. The module may lie beside the scenario's file, or in a
+folder named before it, relative to that file: `filters/my_module:Class`. The other keys are the
+constructor's keyword arguments; an argument named `parameters` that is a dataclass is written flat.
+What the diagram provides (the waypoints, ...) is handed to constructor arguments of that name.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import importlib.machinery
 import inspect
 import sys
 import typing
@@ -23,9 +25,19 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from diagrams.schema import Place, check_keys, construct, convert, field_hints, to_plain
+from diagrams.schema import (
+    Place,
+    ScenarioError,
+    check_keys,
+    construct,
+    convert,
+    field_hints,
+    is_plain,
+    to_plain,
+)
 from systems.validation import nearest
 
 _SIMPLE = (float, int, bool, str)
@@ -36,7 +48,7 @@ class Choice:
     """A block, resolved: what to construct and the checked arguments.
 
     Attributes:
-        type: the name in the scenario.
+        type: the name in the scenario; of a module found beside it, with the absolute folder.
         target: the class.
         arguments: checked keyword arguments, the dataclass `parameters` as one.
         place: where the block stands.
@@ -45,7 +57,7 @@ class Choice:
     type: str
     target: Any
     arguments: dict[str, Any]
-    place: Place
+    place: Place = dataclasses.field(compare=False, repr=False)
 
     def build(self, **resources: Any) -> Any:
         """Constructs the block.
@@ -55,11 +67,18 @@ class Choice:
                 name, if it has one and the scenario does not give it.
 
         Raises:
-            ScenarioError: the constructor refuses its arguments.
+            ScenarioError: the constructor refuses its arguments, or raises anything else.
         """
         accepted = _constructor_hints(self.target)
         given = {k: v for k, v in resources.items() if k in accepted}
-        return construct(self.target, given | self.arguments, self.place)
+        try:
+            return construct(self.target, given | self.arguments, self.place)
+        except ScenarioError:
+            raise
+        except Exception as error:  # whatever a user's class raises
+            raise self.place.error(
+                f"{self.place}: {self.target.__name__} raises {type(error).__name__}: {error}"
+            ) from error
 
     def to_plain(self) -> Any:
         """Returns the block as plain data, defaults filled in."""
@@ -77,11 +96,13 @@ class Table:
         kind: what it is, for messages: "estimator".
         entries: name to "module:Class".
         resources: names of constructor arguments that the diagram provides.
+        method: what every class of this kind has; it tells what cannot be one at all.
     """
 
     kind: str
     entries: Mapping[str, str]
     resources: frozenset[str] = frozenset()
+    method: str = "GetOutputPort"
 
     def convert(self, value: Any, place: Place) -> Choice:
         """Resolves a block (see the module's docstring).
@@ -90,17 +111,19 @@ class Table:
             ScenarioError: an unknown name or key, a class that cannot be imported, a value of the
                 wrong type, an argument that is missing.
         """
+        name_place = place
         if isinstance(value, str):
             value = {"type": value}
+        elif (*place.key, "type") in place.origins:
+            name_place = place / "type"
         if not isinstance(value, Mapping) or not isinstance(value.get("type"), str):
-            raise place.expected(value, f"the name of a {self.kind} or a mapping with 'type'")
-        name = value["type"]
-        target = self.target(name, place)
+            raise place.expected(value, f"a name (of the {self.kind}) or a mapping with 'type'")
+        name, target = self.target(value["type"], name_place)
         keys = {key: v for key, v in value.items() if key != "type"}
         hints = _constructor_hints(target)
         parameters = _dataclass_of(hints.get("parameters"))
         flat = field_hints(parameters) if parameters else {}
-        direct = {k: h for k, h in hints.items() if k != "parameters" and _is_plain(h)}
+        direct = {k: h for k, h in hints.items() if k != "parameters" and _is_plain_hint(h)}
         check_keys(keys, {"type": str} | flat | direct, place)
         arguments = {k: convert(keys[k], h, place / k) for k, h in direct.items() if k in keys}
         if parameters:
@@ -111,34 +134,70 @@ class Table:
             if key in arguments or key in self.resources:
                 continue
             if default is inspect.Parameter.empty:
-                raise place.error(f"{place}: {name} lacks the key {key!r}")
-            if key in direct:
+                raise place.error(f"{place}: {target.__name__} lacks the key {key!r}")
+            if key in direct and is_plain(default):
                 arguments[key] = default
-        return Choice(name, target, arguments, place)
+        in_order = {key: arguments[key] for key in hints if key in arguments}
+        return Choice(name, target, in_order, place)
 
-    def target(self, name: str, place: Place) -> Any:
-        """Returns the class of that name, imported (see `convert` for the errors)."""
+    def target(self, name: str, place: Place) -> tuple[str, Any]:
+        """Returns a name as `Choice.type` has it and its class (see `convert` for the errors)."""
         path = self.entries.get(name, name)
         if ":" not in path:
             hint = nearest(name, self.entries)
             raise place.error(
                 f"{place} is {name!r}: no such {self.kind}; {hint} (or 'module:Class')"
             )
-        module_name, class_name = path.split(":", 1)
+        location, class_name = path.rsplit(":", 1)
         try:
-            with _importable_from(place.folders):
-                module = importlib.import_module(module_name)
+            module, folder = _import(location, place)
         except Exception as error:  # whatever a user's module raises while it is imported
             raise place.error(
-                f"{place} is {name!r}: cannot import {module_name}: {type(error).__name__}: {error}"
+                f"{place} is {name!r}: cannot import {location}: {type(error).__name__}: {error}"
             ) from error
-        if not hasattr(module, class_name):
+        target = getattr(module, class_name, None)
+        if target is None:
             names = [n for n, v in vars(module).items() if inspect.isclass(v)]
             raise place.error(
-                f"{place} is {name!r}: {module_name} has no {class_name!r}; "
+                f"{place} is {name!r}: {location} has no {class_name!r}; "
                 f"{nearest(class_name, names)}"
             )
-        return getattr(module, class_name)
+        if not inspect.isclass(target) or not hasattr(target, self.method):
+            raise place.error(
+                f"{place} is {name!r}: must be the {self.kind}'s class, with a method {self.method}"
+            )
+        try:
+            _constructor_parameters(target)
+        except ValueError as error:
+            raise place.error(
+                f"{place} is {name!r}: {class_name} has no constructor written in Python that says "
+                "what its arguments are"
+            ) from error
+        if folder is not None and name not in self.entries:
+            name = f"{folder}/{module.__name__}:{class_name}"
+        return str(name), target
+
+
+def _import(location: str, place: Place) -> tuple[ModuleType, Path | None]:
+    """Imports `module` or `folder/module`; returns it and its folder, if beside the scenario.
+
+    Raises:
+        ImportError: the folder's module is hidden by another of the same name.
+    """
+    before, _, name = location.rpartition("/")
+    folders = [(folder / before).resolve() for folder in place.search_path()]
+    with _importable_from(folders):
+        module = importlib.import_module(name)
+    top = sys.modules[name.partition(".")[0]]
+    for folder in folders:
+        spec = importlib.machinery.PathFinder.find_spec(top.__name__, [str(folder)])
+        if spec is not None and spec.origin == getattr(top, "__file__", None):
+            return module, folder
+        if before and spec is not None:
+            raise ImportError(f"{top.__name__} was imported already, from another place: {top}")
+    if before:
+        raise ImportError(f"no {top.__name__} in {' or '.join(map(str, folders))}")
+    return module, None
 
 
 @contextmanager
@@ -157,16 +216,24 @@ def _constructor(target: Any) -> Any:
     return getattr(target, "_construct", target.__init__)
 
 
+def _constructor_parameters(target: Any) -> dict[str, inspect.Parameter]:
+    """Returns the constructor's arguments; raises `ValueError` for one that is not Python's."""
+    return {
+        name: parameter
+        for name, parameter in inspect.signature(_constructor(target)).parameters.items()
+        if name not in ("self", "converter")
+        and parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+    }
+
+
 def _constructor_hints(target: Any) -> dict[str, Any]:
     if dataclasses.is_dataclass(target):
         return field_hints(typing.cast(type, target))
-    function = _constructor(target)
     try:
-        hints = typing.get_type_hints(function, include_extras=True)
+        hints = typing.get_type_hints(_constructor(target), include_extras=True)
     except NameError:  # a hint that exists only for type checkers
         hints = {}
-    names = inspect.signature(function).parameters
-    return {name: hints.get(name, Any) for name in names if name not in ("self", "converter")}
+    return {name: hints.get(name, Any) for name in _constructor_parameters(target)}
 
 
 def _constructor_defaults(target: Any) -> dict[str, Any]:
@@ -179,12 +246,7 @@ def _constructor_defaults(target: Any) -> dict[str, Any]:
             else f.default
             for f in dataclasses.fields(target)
         }
-    return {
-        name: parameter.default
-        for name, parameter in inspect.signature(_constructor(target)).parameters.items()
-        if name not in ("self", "converter")
-        and parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
-    }
+    return {name: p.default for name, p in _constructor_parameters(target).items()}
 
 
 def _dataclass_of(hint: Any) -> type | None:
@@ -195,7 +257,7 @@ def _dataclass_of(hint: Any) -> type | None:
     return None
 
 
-def _is_plain(hint: Any) -> bool:
+def _is_plain_hint(hint: Any) -> bool:
     """Whether a scenario can write a value of this type."""
     if hint in _SIMPLE or hint is Any or dataclasses.is_dataclass(hint):
         return True
@@ -204,4 +266,4 @@ def _is_plain(hint: Any) -> bool:
     arguments = [a for a in typing.get_args(hint) if a is not type(None)]
     if typing.get_origin(hint) is typing.Annotated:
         return True
-    return bool(arguments) and all(_is_plain(a) for a in arguments)
+    return bool(arguments) and all(_is_plain_hint(a) for a in arguments)

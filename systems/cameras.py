@@ -8,6 +8,7 @@ is added in `PinholeCamera.to_drake` and nowhere else.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ class PinholeCamera:
     def __post_init__(self) -> None:
         require(self.width > 0, "width", self.width, "greater than 0")
         require(self.height > 0, "height", self.height, "greater than 0")
-        K = np.asarray(self.K, float)
+        K = np.array(self.K, float)
         D = np.asarray(self.D, float).ravel()
         require(K.size == 9, "K", self.K, "9 numbers, row by row")
         K = K.reshape(3, 3)
@@ -85,6 +86,17 @@ class PinholeCamera:
     def distorted(self) -> bool:
         """Whether any distortion coefficient differs from zero."""
         return bool(self.D.any())
+
+    @cached_property
+    def fold_radius(self) -> float:
+        """How far from the axis (x/z, y/z) the distortion model holds; infinite for everywhere.
+
+        There its radial polynomial turns round and folds what lies beyond back into the picture.
+        """
+        k1, k2, _, _, k3 = self.D
+        roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])  # of the slope, in the squared radius
+        folds = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
+        return float(np.sqrt(folds.min(initial=np.inf)))
 
     def project(self, p_C: Array) -> Array:
         """Projects points.
@@ -143,7 +155,7 @@ class PinholeCamera:
         # rounding error, and what does not converge is marked instead of returned.
         guess = target
         with np.errstate(all="ignore"):
-            for _ in range(10):
+            for _ in range(20):
                 distorted, jacobian = self._distort(guess)
                 error = target - distorted
                 size = np.abs(error).max(initial=0.0)
@@ -154,9 +166,12 @@ class PinholeCamera:
                 ex, ey = error[..., 0], error[..., 1]
                 step = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
                 guess = guess + step / (a * d - b * c)[..., None]
+            # Beyond the fold the same pixel has other rays too, some on the far side of the axis.
+            right = np.hypot(guess[..., 0], guess[..., 1]) < self.fold_radius
             if not size < 1e-9:
-                wrong = ~(np.abs(error).max(axis=-1) < 1e-6)
-                guess = np.where(wrong[..., None], np.nan, guess)
+                right &= np.abs(error).max(axis=-1) < 1e-6
+            if not right.all():
+                guess = np.where(right[..., None], guess, np.nan)
         return guess, jacobian * focal[:, None]
 
     def _distort(self, normalised: Array) -> tuple[Array, Array]:
@@ -243,17 +258,25 @@ def camera_from_mapping(content: Any) -> PinholeCamera:
     if "image_width" in content:  # as ROS writes it
         model = content.get("distortion_model", "plumb_bob")
         require(model == "plumb_bob", "distortion_model", model, "plumb_bob")
+        matrices = {}
+        for name in ("camera_matrix", "distortion_coefficients"):
+            matrix = content.get(name)
+            require(
+                isinstance(matrix, dict) and "data" in matrix, name, matrix, "a mapping with data"
+            )
+            matrices[name] = matrix["data"]
         content = {
             "width": content["image_width"],
             "height": content.get("image_height"),
-            "K": (content.get("camera_matrix") or {}).get("data"),
-            "D": (content.get("distortion_coefficients") or {}).get("data", []),
+            "K": matrices["camera_matrix"],
+            "D": matrices["distortion_coefficients"],
         }
     unknown = sorted(set(content) - {"width", "height", "K", "D"})
     require(not unknown, "key", ", ".join(map(str, unknown)), "one of width, height, K, D")
     for name in ("width", "height"):
         value = content.get(name)
-        require(isinstance(value, int) and value > 0, name, value, "a whole number of pixels")
+        whole = isinstance(value, int) and not isinstance(value, bool)
+        require(whole and value > 0, name, value, "a whole number of pixels")
     numbers = {}
     for name in ("K", "D"):
         try:

@@ -29,7 +29,8 @@ def require_non_negative(**values: float) -> None:
 def nearest(word: str, known: Iterable[str]) -> str:
     """Returns a hint for a word that is not among `known`: the nearest one, else all of them."""
     choices = sorted(known)
-    close = difflib.get_close_matches(word, choices, n=1, cutoff=0.6)
+    in_lower_case = {choice.lower(): choice for choice in choices}
+    close = difflib.get_close_matches(word.lower(), in_lower_case, n=1, cutoff=0.6)
     if close:
-        return f"did you mean {close[0]!r}?"
+        return f"did you mean {in_lower_case[close[0]]!r}?"
     return "known: " + ", ".join(choices) if choices else "none is known"

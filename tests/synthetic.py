@@ -7,8 +7,9 @@ to be aligned with. Blur, noise and rounding come after. Nothing here shares cod
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from systems.markers.family import Family
 Array = NDArray[np.float64]
 Warp = Callable[[Array], Array]
 
-_PIECES = 12  # straight pieces that a cell's side is cut into where the picture is warped
+_PIECES = 40  # straight pieces that a line is cut into where the picture is warped
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +51,14 @@ class Sheet:
             self.H, grow * np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
         )
 
-    def black_cells(self) -> Array:
-        """The outlines of the black cells: (n, 4, 2) px."""
-        rows, columns = np.nonzero(self.family.cell_image(self.id, margin=0) == 0)
-        lower = np.stack([columns, rows], axis=-1) / self.family.cells - 0.5
-        square = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) / self.family.cells
-        return _transform(self.H, lower[:, None] + square)
+    def ink(self) -> Array:
+        """The outlines of the runs of black cells in each row: (n, 4, 2) px."""
+        black = self.family.cell_image(self.id, margin=0) == 0
+        steps = np.diff(np.pad(black, ((0, 0), (1, 1))).astype(int), axis=1)
+        (row, first), (_, last) = np.nonzero(steps == 1), np.nonzero(steps == -1)
+        x = np.stack([first, last, last, first], axis=-1)
+        y = np.stack([row, row, row + 1, row + 1], axis=-1)
+        return _transform(self.H, np.stack([x, y], axis=-1) / self.family.cells - 0.5)
 
 
 def posed_homography(
@@ -111,6 +114,27 @@ def random_homography(
     )
 
 
+def random_sheets(
+    rng: np.random.Generator,
+    family: Family,
+    *,
+    shape: tuple[int, int] = (480, 640),
+    pitch: int = 160,
+    side: tuple[float, float] = (30.0, 70.0),
+    max_tilt: float = np.deg2rad(60.0),
+) -> list[Sheet]:
+    """Sheets in a grid of that pitch (px), each turned, tilted and sized at random, ids in turn."""
+    places = [
+        (x, y)
+        for y in range(pitch // 2, shape[0] - pitch // 2 + 1, pitch)
+        for x in range(pitch // 2, shape[1] - pitch // 2 + 1, pitch)
+    ]
+    return [
+        Sheet(family, i, random_homography(rng, centre=place, side=side, max_tilt=max_tilt))
+        for i, place in enumerate(places)
+    ]
+
+
 def draw(
     shape: tuple[int, int],
     sheets: Sequence[Sheet],
@@ -140,7 +164,7 @@ def draw(
     picture = np.array(np.broadcast_to(ground, shape), float)
     for sheet in sheets:
         paper = coverage(shape, sheet.rim()[None], warp)
-        ink = coverage(shape, sheet.black_cells(), warp)
+        ink = coverage(shape, sheet.ink(), warp)
         picture += (white - picture) * paper - (white - black) * ink
     if light is not None:
         picture = picture * light
@@ -167,21 +191,23 @@ def jagged(
     white: float = 220.0,
     ground: float = 130.0,
 ) -> NDArray[np.uint8]:
-    """Draws sheets as a renderer without anti-aliasing does: a pixel shows what is at its centre."""
+    """Draws sheets without anti-aliasing: a pixel shows what is at its centre."""
     height, width = shape
-    x, y = np.meshgrid(np.arange(width), np.arange(height))
-    centres = np.stack([x, y], axis=-1).reshape(-1, 2).astype(float)
-    picture = np.full(height * width, float(ground))
+    picture = np.full(shape, float(ground))
     for sheet in sheets:
         cells = sheet.family.cells
-        place = (_transform(np.linalg.inv(sheet.H), centres) + 0.5) * cells
-        seen = ((place > -sheet.margin) & (place < cells + sheet.margin)).all(axis=1)
-        picture[seen] = white
-        inside = seen & ((place >= 0) & (place < cells)).all(axis=1)
+        (left, top), (right, bottom) = sheet.rim().min(axis=0), sheet.rim().max(axis=0)
+        columns = slice(max(0, int(left)), min(width, int(right) + 2))
+        rows = slice(max(0, int(top)), min(height, int(bottom) + 2))
+        y, x = np.mgrid[rows, columns].astype(float)
+        place = (_transform(np.linalg.inv(sheet.H), np.stack([x, y], axis=-1)) + 0.5) * cells
+        part = picture[rows, columns]
+        part[((place > -sheet.margin) & (place < cells + sheet.margin)).all(axis=-1)] = white
+        inside = ((place >= 0) & (place < cells)).all(axis=-1)
         column, row = place[inside].astype(int).T
         code = sheet.family.cell_image(sheet.id, margin=0)
-        picture[inside] = np.where(code[row, column] == 0, black, white)
-    return picture.reshape(shape).astype(np.uint8)
+        part[inside] = np.where(code[row, column] == 0, black, white)
+    return picture.astype(np.uint8)
 
 
 def coverage(shape: tuple[int, int], polygons: Array, warp: Warp | None = None) -> Array:
@@ -228,6 +254,50 @@ def coverage(shape: tuple[int, int], polygons: Array, warp: Warp | None = None) 
         np.add.at(mean, (row, column + 1), right)
     # Clockwise with y down: the outline runs up on the left side, so the sum comes out negative.
     return -np.cumsum(mean[:, :width], axis=1)
+
+
+class CornerErrors(NamedTuple):
+    """How far found corners lie from the true ones, over all corners.
+
+    Attributes:
+        found: share of the markers that were found.
+        std: standard deviation of x and y, px.
+        shift: the larger of the mean errors in x and in y, px.
+        grow: mean error away from the marker's centre, px; negative where squares come out small.
+        worst: largest error in x or y, px.
+    """
+
+    found: float
+    std: float
+    shift: float
+    grow: float
+    worst: float
+
+
+def corner_errors(pictures: Iterable[tuple[Array, Array, Array]]) -> CornerErrors:
+    """Compares found corners with true ones.
+
+    Args:
+        pictures: for each picture the ids found (n,), their corners (n, 4, 2), and the true corners
+            by id (m, 4, 2): marker i of the picture has the id i.
+    """
+    errors, outward, true_count = [], [], 0
+    for ids, corners, truth in pictures:
+        assert len(set(ids.tolist())) == len(ids), "an id was found twice"
+        true = truth[ids]
+        errors.append(corners - true)
+        spoke = true - true.mean(axis=1, keepdims=True)
+        spoke /= np.linalg.norm(spoke, axis=-1, keepdims=True)
+        outward.append(((corners - true) * spoke).sum(axis=-1))
+        true_count += len(truth)
+    error = np.concatenate(errors)
+    return CornerErrors(
+        found=len(error) / true_count,
+        std=float(error.std(axis=(0, 1)).mean()),
+        shift=float(np.abs(error.mean(axis=(0, 1))).max()),
+        grow=float(np.concatenate(outward).mean()),
+        worst=float(np.abs(error).max()),
+    )
 
 
 def _transform(H: Array, points: Array) -> Array:

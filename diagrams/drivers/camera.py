@@ -12,12 +12,12 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import OutputPort
 from pydrake.systems.primitives import ConstantValueSource
 
-from diagrams.channels import detections_signal, image_signal
-from diagrams.schema import File, file_path
+from diagrams.channels import detections_signal, image_signal, topic_of
+from diagrams.schema import File, ScenarioError, file_path
 from diagrams.station import RENDERER, Robot, StationBuilder
 from systems.cameras import PinholeCamera, load_camera
 from systems.image_effects import ImageEffects
-from systems.io.ros_vision import camera_to_ros
+from systems.io.ros_vision import camera_to_ros, image_from_ros
 from systems.markers.detector import Detector, DetectorParameters, MarkerDetector
 from systems.markers.projector import MarkerProjector, ProjectorParameters, placed_markers
 from systems.messages import CameraImage, Health
@@ -80,7 +80,7 @@ class Camera:
         name = f"{robot.name}.{device}"
         camera = self.model()
         frame_id = name.replace(".", "/")
-        station.static_messages[f"/{frame_id}/camera_info"] = (
+        station.static_messages[topic_of(f"{name}.camera_info")] = (
             "sensor_msgs/msg/CameraInfo",
             camera_to_ros(camera, stamp=0.0, frame_id=frame_id),
         )
@@ -112,6 +112,24 @@ class Camera:
         station.export_output(image, images.port, images)
         station.export_output(detections, found.port, found)
 
+    def _check_recorded_size(
+        self, station: StationBuilder, name: str, camera: PinholeCamera
+    ) -> None:
+        """Raises `ScenarioError` when the recorded pictures are not of the calibration's size."""
+        assert station.player is not None
+        info, pictures = topic_of(f"{name}.camera_info"), image_signal(name, self.rate).topic
+        for topic in [t for t in (info, pictures) if t in station.player.topics()][:1]:
+            message = next(station.player.messages([topic]))[2]
+            if topic == info:
+                width, height = message.width, message.height
+            else:
+                height, width = image_from_ros(message).data.shape[:2]
+            if (width, height) != (camera.width, camera.height):
+                raise ScenarioError(
+                    f"camera file {self.calibration} is for pictures of {camera.width}x"
+                    f"{camera.height}: {topic} of the recording is of {width}x{height}"
+                )
+
     def _sources(
         self, station: StationBuilder, robot: Robot, name: str, camera: PinholeCamera
     ) -> tuple[OutputPort | None, OutputPort | None]:
@@ -120,6 +138,7 @@ class Camera:
         Without detections there are pictures, for the detector to look at.
         """
         if not station.simulated:
+            self._check_recorded_size(station, name, camera)
             image = station.play(image_signal(name, self.rate), optional=True)
             if image is not None:
                 return image, None
@@ -149,8 +168,8 @@ class Camera:
             )
             return None, projector.detections_output_port()
         station.need_renderer()
-        rendered = station.add(
-            RenderedCamera(
+        try:
+            sensor = RenderedCamera(
                 camera=camera,
                 parent_frame=robot.frame_id,
                 X_PC=self.mounting(),
@@ -161,9 +180,10 @@ class Camera:
                 seed=station.seed,
                 name=name,
                 frame_id=frame_id,
-            ),
-            name,
-        )
+            )
+        except ValueError as error:  # a distortion that cannot be rendered
+            raise ScenarioError(f"camera file {self.calibration}: {error}") from error
+        rendered = station.add(sensor, name)
         station.connect(
             station.scene_graph.get_query_output_port(), rendered.query_object_input_port()
         )

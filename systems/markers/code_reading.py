@@ -57,13 +57,13 @@ class CodeReader:
         row, column = (axis.ravel() for axis in np.mgrid[:side, :side])
         ring = np.minimum(np.minimum(row, column), side - 1 - np.maximum(row, column))
         code = ring > 1
-        centres = np.stack([column - 0.5, row - 0.5, np.full(side**2, family.cells)], axis=-1)
+        centres = np.stack([column - 0.5, row - 0.5, np.full(side**2, family.cells)])
         self._centres = centres / family.cells
         # Threshold and sharpening are linear: from the samples of all cells to their heights above
         # the threshold it is one matrix.
         threshold = np.zeros((side**2, side**2))
         for which in (ring == 0, ring == 1):
-            threshold[:, which] += self._centres @ np.linalg.pinv(self._centres[which]) / 2
+            threshold[:, which] += self._centres.T @ np.linalg.pinv(self._centres[:, which].T) / 2
         near = np.abs(row[:, None] - row) + np.abs(column[:, None] - column) == 1
         sharpen = np.eye(side**2) + _SHARPENING * (np.diag(near.sum(axis=1)) - near)
         self._to_height = (sharpen @ (np.eye(side**2) - threshold)).T.astype(np.float32)
@@ -91,10 +91,10 @@ class CodeReader:
             camera: the lens, where it distorts.
 
         Returns:
-            The reading. Where the lens model cannot be inverted, it means nothing.
+            The reading. Where the lens model cannot be inverted, all cells are wrong.
         """
-        xy = self._places(corners, camera).astype(np.float32)
-        samples = cv2.remap(image, xy, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        x, y = self._places(corners, camera).astype(np.float32).swapaxes(0, 1)
+        samples = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         height = samples.astype(np.float32) @ self._to_height
         agreement = height * self._sign[ids]
         wrong = (agreement < _LEAST).astype(np.float32)
@@ -107,12 +107,14 @@ class CodeReader:
         return Reading(hamming, margin / 2, rim_errors)
 
     def _places(self, corners: Array, camera: PinholeCamera | None) -> Array:
-        """Returns the centres of the cells in the picture, (n, cells, 2) px."""
+        """Returns the centres of the cells in the picture, (n, 2, cells) px."""
         lens = camera if camera is not None and camera.distorted else None
-        if lens is not None:
-            corners = to_ideal(corners, lens)
-        H = [cv2.getPerspectiveTransform(_UNIT_SQUARE, c) for c in corners.astype(np.float32)]
-        homogeneous = self._centres @ np.stack(H).swapaxes(1, 2)
         with np.errstate(all="ignore"):
-            places = homogeneous[..., :2] / homogeneous[..., 2:]
-        return places if lens is None else to_picture(places, lens)
+            if lens is not None:
+                corners = to_ideal(corners, lens)
+            H = [cv2.getPerspectiveTransform(_UNIT_SQUARE, c) for c in corners.astype(np.float32)]
+            homogeneous = (np.concatenate(H) @ self._centres).reshape(len(H), 3, -1)
+            places = homogeneous[:, :2] / homogeneous[:, 2:]
+            if lens is not None:
+                places = to_picture(places.swapaxes(1, 2), lens).swapaxes(1, 2)
+        return places

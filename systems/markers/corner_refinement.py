@@ -31,17 +31,14 @@ Grey = NDArray[np.uint8]
 
 _NEXT, _PREVIOUS = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 
-_START_ERROR = 2.0  # px that an engine's corner may be wrong
-_MOST_LEFT_OUT = 0.5  # of half an edge, however short
-
 # The search for the step.
 _SEARCH_LINES = 12
 _SEARCH_SHARE = 0.9  # of an edge, away from its corners
 _SEARCH_SAMPLES = 13
 _SEARCH_RANGE = 3.0  # px either side
 _SEARCH_CELLS = (0.4, 1.3)  # it grows to the first share of a cell, and is never above the second
-_SEARCH_LIMIT = 8.0  # px
-_LEAST_WEIGHT = 1e-6
+_FARTHEST = 8.0  # px that a search goes, or a corner is moved
+_LEAST_WEIGHT = 1e-6  # where nothing rises, quotients come out as zero
 
 # The measurement. Seven samples over 1.5 px either side are half a pixel apart: at a whole
 # fraction of a pixel the bilinear samples of an axis-parallel edge add up to its exact area.
@@ -52,7 +49,8 @@ _WINDOW = 2.5  # half the window, in standard deviations of the step
 _CLEAR = 1.7  # as many are kept away from the next edges, one cell further in and out
 _NARROWEST = 1.0  # px
 _TOLERANCE = 0.1  # of half the window: scan lines this close to their line all count alike
-_CORNER = 1.0  # px beyond the window's half width that are left out at either end of an edge
+_CORNER = 1.0  # px beyond half the window that are left out at either end of an edge
+_MOST_LEFT_OUT = 0.5  # of half an edge, however short
 
 
 def refine_corners(
@@ -61,8 +59,8 @@ def refine_corners(
     """Moves the corners of dark squares on light paper to where their edges really meet.
 
     Samples are taken within one cell of each edge, so a white margin of one cell is enough. An
-    edge that cannot be measured (hidden, outside the picture, without contrast) stays where the
-    start has it. The start may be wrong by about 2 px.
+    edge that cannot be measured (hidden, outside the picture, without contrast) stays about where
+    the start has it. The start may be wrong by 2 px, on markers of less than 30 px by 1 px.
 
     Args:
         image: (height, width) grey.
@@ -77,29 +75,34 @@ def refine_corners(
     if len(corners) == 0:
         return corners
     lens = camera if camera is not None and camera.distorted else None
-    start = np.ascontiguousarray(corners, float).view(np.complex128)[..., 0]
+    start = _complex(corners)
     with np.errstate(all="ignore"):
-        edges = _edges(start if lens is None else to_ideal(start, lens), cells)
+        edges = _edges(start if lens is None else _complex(to_ideal(corners, lens)), cells)
         found = _intersections(_measure(image, edges, *_search(image, edges, lens), lens))
         if lens is not None:
-            found = to_picture(found, lens)
-        np.copyto(found, start, where=~(np.abs(found - start) < _SEARCH_LIMIT))  # NaN too
-    return found[..., None].view(np.float64)
+            found = _complex(to_picture(_pairs(found), lens))
+        np.copyto(found, start, where=~(np.abs(found - start) < _FARTHEST))  # NaN too
+    return _pairs(found)
 
 
-def to_ideal(points: Points, camera: PinholeCamera) -> Points:
-    """Takes pixels to where they would be without distortion; NaN where there is no such place."""
-    K = camera.K
-    rays = camera.undistort(points[..., None].view(np.float64))
-    return rays[..., 0] * K[0, 0] + K[0, 2] + 1j * (rays[..., 1] * K[1, 1] + K[1, 2])
+def to_ideal(pixels: Array, camera: PinholeCamera) -> Array:
+    """Takes pixels (..., 2) to where they would be without distortion; NaN if there is no place."""
+    return camera.undistort(pixels) * camera.K[[0, 1], [0, 1]] + camera.K[:2, 2]
 
 
-def to_picture(points: Points, camera: PinholeCamera) -> Points:
-    """Takes pixels of the ideal picture to the distorted one."""
-    K = camera.K
-    x = (points.real - K[0, 2]) / K[0, 0]
-    y = (points.imag - K[1, 2]) / K[1, 1]
-    return camera.project(np.stack([x, y, np.ones_like(x)], axis=-1)).view(np.complex128)[..., 0]
+def to_picture(pixels: Array, camera: PinholeCamera) -> Array:
+    """Takes pixels (..., 2) of the ideal picture to the distorted one."""
+    rays = np.ones((*pixels.shape[:-1], 3))
+    rays[..., :2] = (pixels - camera.K[:2, 2]) / camera.K[[0, 1], [0, 1]]
+    return camera.project(rays)
+
+
+def _complex(pairs: Array) -> Points:
+    return np.ascontiguousarray(pairs, float).view(np.complex128)[..., 0]
+
+
+def _pairs(points: Points) -> Array:
+    return points[..., None].view(np.float64)
 
 
 class _Edges(NamedTuple):
@@ -133,7 +136,7 @@ def _search(image: Grey, edges: _Edges, lens: PinholeCamera | None) -> tuple[Poi
         scanned; and the standard deviation of each one's step, (4n,) px.
     """
     narrow, wide = _SEARCH_CELLS
-    reach = np.minimum(np.maximum(narrow * edges.cell, _SEARCH_RANGE), _SEARCH_LIMIT)
+    reach = np.minimum(np.maximum(narrow * edges.cell, _SEARCH_RANGE), _FARTHEST)
     reach = np.minimum(reach, wide * edges.cell)
     frame = np.array([edges.middle, edges.half * _SEARCH_SHARE, edges.normal * reach])
     profiles = _profiles(image, frame, _SEARCH_PLACES, lens)
@@ -144,7 +147,7 @@ def _search(image: Grey, edges: _Edges, lens: PinholeCamera | None) -> tuple[Poi
     # So that no scan line counts more than the others together, however bright its rise.
     moments /= moments[0] + (_SEARCH_MEAN @ moments[0] + _LEAST_WEIGHT)
     weight, first, second = moments
-    second -= first * first / weight
+    second -= first * first / (weight + _LEAST_WEIGHT)
     weight, first, second = _SEARCH_ALONG @ moments
     blur = np.sqrt(2 * second[0] / weight[0]) * reach  # 2: a squared Gaussian is narrower
     return frame[:2] + _solve(weight, first[:2]) * frame[2], blur
@@ -176,12 +179,12 @@ def _measure(
     if residual.max() > _TOLERANCE:
         # Once more with outliers weighted down, and without the scan lines that meet no step:
         # hidden ones, and those beyond the rim, where the picture goes on as its last pixel.
-        ratio = residual / (2 * (_MEAN @ residual) + _TOLERANCE / 2)
+        ratio = residual / (3 * (_MEAN @ residual) + _TOLERANCE / 2)
         ratio *= ratio
         ratio *= ratio
         weight = (contrast > 0.5 * mean) / (1 + ratio)
         solution = _solve(_ALONG @ weight, _ALONG[:2] @ (weight * place))
-    trusted = np.abs(solution).max(axis=0) < 1
+    trusted = np.maximum(*np.abs(solution)) < 1  # inside the window that was looked at
     return frame[:2] + solution * (frame[2] * trusted)
 
 
@@ -201,11 +204,10 @@ def _profiles(
     """
     # One product lays out all the maps; its columns are x and y in turn.
     xy = places.reshape(-1, 3) @ frame.astype(np.complex64).view(np.float32)
-    if lens is not None:
-        ideal = xy.view(np.complex64).astype(np.complex128)
-        xy = to_picture(ideal, lens).astype(np.complex64).view(np.float32)
     # Their shape has no meaning, but OpenCV takes no more than 32767 rows or columns.
     xy = xy.reshape(frame.shape[1], -1, 2)
+    if lens is not None:
+        xy = to_picture(xy.astype(np.float64), lens).astype(np.float32)
     samples = cv2.remap(image, xy, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
     return samples.astype(np.float32).reshape(*places.shape[:2], -1)
 

@@ -106,9 +106,12 @@ class MarkerDetector:
         self.family = family_by_name(family) if isinstance(family, str) else family
         self.parameters = parameters or DetectorParameters()
         self.camera = camera
-        self._hamming_max = min(self.parameters.hamming_max, self.family.max_correction // 2)
-        engine = _AprilTagEngine if self.family.is_apriltag else _ArucoEngine
-        self._engine: _Engine = engine(self.family, self.parameters, self._hamming_max)
+        self._hamming_max = min(int(self.parameters.hamming_max), self.family.max_correction // 2)
+        self._engine: _Engine = (
+            _AprilTagEngine(self.family, self.parameters, self._hamming_max)
+            if self.family.is_apriltag
+            else _ArucoEngine(self.family)
+        )
         self._reader = CodeReader(family=self.family)
 
     def detect(self, image: Grey, stamp: float = math.nan, frame_id: str = "") -> Detections:
@@ -134,15 +137,17 @@ class MarkerDetector:
         if grey.ndim == 3:
             grey = cv2.cvtColor(grey, cv2.COLOR_RGB2GRAY)
         ids, corners = self._find(grey)
-        if self.parameters.refine:
+        if len(ids) == 0:
+            return Detections(stamp=stamp, frame_id=frame_id, family=self.family.name)
+        limits = self.parameters
+        if limits.refine:
             corners = refine_corners(grey, corners, self.family.cells, self.camera)
         reading = self._reader.read(grey, ids, corners, self.camera)
-        sides = np.hypot(*(corners - corners[:, [1, 2, 3, 0]]).T)
         good = (
             (reading.hamming <= self._hamming_max)
-            & (reading.rim_errors <= self.parameters.rim_errors_max * self._reader.rim_cells)
-            & (reading.decision_margin >= self.parameters.min_decision_margin)
-            & (sides.min(axis=0) >= self.parameters.min_side)
+            & (reading.rim_errors <= limits.rim_errors_max * self._reader.rim_cells)
+            & (reading.decision_margin >= limits.min_decision_margin)
+            & (_shortest_sides(corners) >= limits.min_side)
         )
         found = Detections(
             stamp=stamp,
@@ -153,9 +158,7 @@ class MarkerDetector:
             hamming=reading.hamming,
             decision_margin=reading.decision_margin,
         )
-        if not good.all():
-            found = found.select(good)
-        return _without_doubles(found)
+        return _without_doubles(found if good.all() else found.select(good))
 
     def _find(self, grey: Grey) -> Found:
         if min(grey.shape) < self.family.cells + 2:  # no room for a marker of one pixel a cell
@@ -178,10 +181,10 @@ class _Engine(Protocol):
 
 
 class _ArucoEngine:
-    def __init__(self, family: Family, parameters: DetectorParameters, hamming_max: int) -> None:  # noqa: ARG002 - as the other engine
+    def __init__(self, family: Family) -> None:
         settings = cv2.aruco.DetectorParameters()
         settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
-        # Bits read from rough corners may be wrong: those that count are read again.
+        # Bits that it reads from rough corners may be wrong; what counts is read again.
         settings.errorCorrectionRate = 1.0
         self._detector = cv2.aruco.ArucoDetector(family.opencv_dictionary(), settings)
 
@@ -197,7 +200,7 @@ class _AprilTagEngine:
         self._detector = apriltag(
             family.name,
             threads=1,
-            maxhamming=min(hamming_max, 3),  # more takes the engine gigabytes of tables
+            maxhamming=min(hamming_max, 3),  # its tables grow a hundredfold with every bit
             decimate=parameters.decimate,
             blur=parameters.blur,
         )
@@ -206,28 +209,32 @@ class _AprilTagEngine:
         found = self._detector.detect(grey)
         ids = np.array([tag["id"] for tag in found], np.int64)
         corners = np.array([tag["lb-rb-rt-lt"] for tag in found], float).reshape(-1, 4, 2)
-        # From the first pixel's corner to its centre; from the bottom-left to the top-left first.
+        # The top-left corner first, and from the first pixel's corner to its centre.
         return ids, corners[:, ::-1] - 0.5
+
+
+def _complex(pairs: Array) -> NDArray[np.complex128]:
+    return pairs[..., 0] + 1j * pairs[..., 1]
+
+
+def _shortest_sides(corners: Array) -> Array:
+    return np.abs(_complex(corners - corners.take([1, 2, 3, 0], axis=1))).min(axis=1)
 
 
 def _without_doubles(found: Detections) -> Detections:
     """Drops a marker that overlaps a surer one of the same id: one marker, seen twice."""
     if len(set(found.ids.tolist())) == len(found):
         return found
-    keep: list[int] = []
-    for i in np.lexsort((-found.decision_margin, found.hamming)):
-        outline = found.corners[i].astype(np.float32)
-        centre = outline.mean(axis=0)
-        for j in keep:
-            other = found.corners[j].astype(np.float32)
-            if found.ids[i] == found.ids[j] and (
-                cv2.pointPolygonTest(other, centre.tolist(), False) >= 0
-                or cv2.pointPolygonTest(outline, other.mean(axis=0).tolist(), False) >= 0
-            ):
-                break
-        else:
-            keep.append(int(i))
-    return found.select(np.sort(keep))
+    # Two overlap when either has the other's centre inside, to the right of all its edges.
+    side = _complex(found.corners.take([1, 2, 3, 0], axis=1)) - _complex(found.corners)
+    spoke = _complex(found.corners.mean(axis=1))[:, None, None] - _complex(found.corners)
+    inside = ((side.conj() * spoke).imag > 0).all(axis=2)
+    double = (inside | inside.T) & (found.ids[:, None] == found.ids)
+    surest_first = np.lexsort((-found.decision_margin, found.hamming))
+    kept = np.zeros(len(found), bool)
+    for i in surest_first:
+        kept[i] = not (double[i] & kept).any()
+    return found if kept.all() else found.select(kept)
 
 
 class Detector(LeafSystem):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.cameras import PinholeCamera
 from systems.health import Counts
+from systems.markers.corner_noise import corner_deviation
 from systems.markers.layout import MarkerMap
 from systems.markers.planar_pose import SAME_POSE, angle_between, closed_form, planar_poses
 from systems.markers.pnp import PnpSolution, covariance, cross_matrix, refine, squared_errors
@@ -21,6 +22,8 @@ from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
 
+_TAIL = 4.0
+
 REASONS = ("unknown_id", "repeated_id", "too_small", "bad_corners", "outlier", "inconsistent")
 
 
@@ -29,7 +32,8 @@ class LocalizerParameters:
     """What is trusted.
 
     Attributes:
-        pixel_noise: standard deviation of a corner's coordinate, px.
+        pixel_noise: standard deviation of a corner's coordinate, of a large marker, px.
+        pixel_noise_by_side: more noise of small ones, px^2 (see `systems.markers.corner_noise`).
         use: `all` markers together, or the `best` one (largest in the picture) alone.
         min_side: markers whose shortest side is shorter are left out, px.
         max_reprojection: a marker whose corners lie further (RMS) from where the common pose puts
@@ -39,6 +43,7 @@ class LocalizerParameters:
     """
 
     pixel_noise: float = 0.3
+    pixel_noise_by_side: float = 0.0
     use: str = "all"
     min_side: float = 12.0
     max_reprojection: float = 2.0
@@ -50,7 +55,9 @@ class LocalizerParameters:
             max_reprojection=self.max_reprojection,
             ambiguity_ratio=self.ambiguity_ratio,
         )
-        require_non_negative(min_side=self.min_side)
+        require_non_negative(
+            min_side=self.min_side, pixel_noise_by_side=self.pixel_noise_by_side
+        )
         require(self.use in ("all", "best"), "use", self.use, "'all' or 'best'")
 
 
@@ -78,18 +85,21 @@ class _View:
         index: (n,) where they are in the map.
         points: (n, 4, 3) their corners in W, m.
         rays: (n, 4, 2) x/z, y/z of the corners.
-        by_ray: (n, 4, 2, 2) derivative of the pixels by the rays, px.
+        by_ray: (n, 4, 2, 2) derivative by the rays of the pixels, in units of their noise: the
+            squared errors of this view are chi-squares, not px^2.
+        deviation: (n,) noise of the corners, px.
     """
 
     index: NDArray[np.intp]
     points: Array
     rays: Array
     by_ray: Array
+    deviation: Array
 
     def select(self, mask: NDArray[np.bool_]) -> _View:
         if mask.all():
             return self
-        return _View(self.index[mask], self.points[mask], self.rays[mask], self.by_ray[mask])
+        return _View(*(getattr(self, entry.name)[mask] for entry in fields(self)))
 
     def refine(self, R: Array, p: Array) -> PnpSolution:
         """Returns the minima over all corners together, from b poses."""
@@ -102,7 +112,7 @@ class _View:
         )
 
     def errors_by_marker(self, R: Array, p: Array) -> Array:
-        """Returns (b, n) squared errors of each marker under each of b poses, px^2."""
+        """Returns (b, n) root mean square errors of each marker under each of b poses, px."""
         b, n = len(R), len(self.index)
         errors = squared_errors(
             R.repeat(n, axis=0),
@@ -111,7 +121,7 @@ class _View:
             np.tile(self.rays, (b, 1, 1)),
             np.tile(self.by_ray, (b, 1, 1, 1)),
         )
-        return errors.reshape(b, n)
+        return np.sqrt(errors.reshape(b, n) / 4) * self.deviation
 
 
 class MapLocalizer:
@@ -154,35 +164,38 @@ class MapLocalizer:
         if len(seen) == 0:
             return Localization(nothing, nothing, dropped)
         rays, by_ray = self.camera.rays(seen.corners)
+        p = self.parameters
+        deviation = corner_deviation(seen.corners, p.pixel_noise, p.pixel_noise_by_side)
+        by_ray = by_ray / deviation[:, None, None, None]
         index = np.array([self._index[int(i)] for i in seen.ids])
-        view = _View(index, self._corners[index], rays, by_ray)
-        used = np.ones(len(seen), bool)
-        if len(seen) == 1:
+        view = _View(index, self._corners[index], rays, by_ray, deviation)
+        solvable, R_CM, p_CM = closed_form(rays, self._sizes[index])
+        dropped["bad_corners"] += int((~solvable).sum())
+        view = view.select(solvable)
+        used = np.ones(len(view.index), bool)
+        if len(view.index) == 0:
+            return Localization(nothing, nothing, dropped)
+        if len(view.index) == 1:
             solutions = self._single(view)
         else:
-            solvable, R_CM, p_CM = closed_form(rays, self._sizes[index])
-            dropped["bad_corners"] += int((~solvable).sum())
-            view = view.select(solvable)
             solutions, used = self._common_pose(*self._candidates(R_CM, p_CM, view.index), view)
         if len(solutions) == 0 or not np.isfinite(solutions.squared_error[0]):
             dropped["bad_corners"] += len(view.index)
             return Localization(nothing, nothing, dropped)
         dropped["outlier"] += int((~used).sum())
-        rms = np.sqrt(solutions.squared_error / (4 * used.sum()))
-        if rms[0] > self.parameters.max_reprojection:
+        by_marker = view.select(used).errors_by_marker(solutions.R, solutions.p)
+        rms = np.sqrt(np.mean(by_marker**2, axis=1))
+        if rms[0] > p.max_reprojection:
             dropped["inconsistent"] += 1
             return Localization(nothing, nothing, dropped)
         ambiguous = False
         if len(solutions) > 1:
-            # Twice the logarithm of the likelihood ratio of Gaussian corner noise.
-            excess = (solutions.squared_error[1] - solutions.squared_error[0]) / (
-                self.parameters.pixel_noise**2
-            )
-            ambiguous = bool(excess < 2 * np.log(self.parameters.ambiguity_ratio))
+            ratio = _log_likelihood_ratio(solutions.squared_error, 8 * int(used.sum()))
+            ambiguous = bool(ratio < np.log(p.ambiguity_ratio))
         estimates = [
             self._estimate(solutions, k, rms[k], detections.stamp, ambiguous, int(used.sum()))
             for k in range(len(solutions))
-            if rms[k] <= self.parameters.max_reprojection
+            if rms[k] <= p.max_reprojection
         ]
         return Localization(estimates[0], estimates[1] if len(estimates) > 1 else nothing, dropped)
 
@@ -194,10 +207,9 @@ class MapLocalizer:
         values, counts = np.unique(ids, return_counts=True)
         once = np.isin(ids, values[counts == 1])  # two of one id: none can be told to be the real
         dropped["repeated_id"] += int((known & ~once).sum())
-        sides = np.linalg.norm(
-            detections.corners - np.roll(detections.corners, 1, axis=1), axis=2
-        ).min(axis=1, initial=np.inf)
-        finite = np.isfinite(sides)
+        finite = np.isfinite(detections.corners).all(axis=(1, 2))
+        corners = np.where(finite[:, None, None], detections.corners, 0.0)
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
         large = sides >= self.parameters.min_side
         dropped["bad_corners"] += int((known & once & ~finite).sum())
         dropped["too_small"] += int((known & once & finite & ~large).sum())
@@ -230,16 +242,17 @@ class MapLocalizer:
         marker that lies further off than `max_reprojection` counts as much as one that lies there.
         """
         used = np.ones(len(view.index), bool)
-        limit = 4 * self.parameters.max_reprojection**2
+        limit = self.parameters.max_reprojection
         # A marker's own pose, carried over to others, errs more than a common pose will: the vote
         # is four times as patient as the verdict.
         by_marker = view.errors_by_marker(R, p)
-        votes = np.minimum(by_marker, 16 * limit).sum(axis=1)
+        votes = (np.minimum(by_marker, 4 * limit) ** 2).sum(axis=1)
         if not np.isfinite(by_marker).any():
             return PnpSolution(R[:0], p[:0], votes[:0], np.zeros((0, 6, 6))), used
         first = int(np.argmin(votes))
-        others = np.flatnonzero(angle_between(R, R[first]) > SAME_POSE)
-        start = np.array([first, *others[np.argsort(votes[others], kind="stable")][:1]])
+        # The same marker's other pose leads to the other minimum, where there is one. The runner-up
+        # of the vote need not: it may be another marker's idea of the first.
+        start = np.array([first, first ^ 1])
         solution = view.refine(R[start], p[start])
         for _ in range(len(used) - 2):
             by_marker = view.errors_by_marker(solution.R[:1], solution.p[:1])[0]
@@ -263,7 +276,7 @@ class MapLocalizer:
         R_CW, p_CW = solutions.R[k], solutions.p[k]
         X_CW = RigidTransform(RotationMatrix(_orthonormal(R_CW)), p_CW)
         X_WB = X_CW.inverse().multiply(self.X_BC.inverse())
-        cov_C = covariance(solutions.information[k], self.parameters.pixel_noise)
+        cov_C = covariance(solutions.information[k], 1.0)
         # (delta, tau) of X_CW in C  ->  (delta', d) of X_WB in W.
         R_WC = R_CW.T
         p_CB_W = R_WC @ self.X_BC.inverse().translation()
@@ -282,6 +295,21 @@ class MapLocalizer:
             ambiguous=ambiguous,
             markers=markers,
         )
+
+
+def _log_likelihood_ratio(squared_error: Array, count: int) -> float:
+    """Returns the logarithm of the likelihood of the first minimum over that of the second.
+
+    Corner errors have heavier tails than a Gaussian's, and one bad edge moves two corners: so the
+    residuals count as a multivariate Student t of `_TAIL` degrees of freedom. Where both minima
+    leave much, more must lie between them.
+
+    Args:
+        squared_error: (2,) of residuals in units of their noise.
+        count: number of residuals.
+    """
+    first, second = squared_error[:2]
+    return float((_TAIL + count) / 2 * np.log((_TAIL + second) / (_TAIL + first)))
 
 
 def _distinct_best_first(solution: PnpSolution) -> PnpSolution:

@@ -109,8 +109,9 @@ def _normal_equations(
     D[..., 0, 1] += az * inverse_depth
     D[..., 0, 2] = -ay * inverse_depth
     D[..., 1, 2] = ax * inverse_depth
-    J = (by_ray @ D).reshape(len(R), -1, 6)
-    r = (by_ray @ (ray - rays)[..., None]).reshape(len(R), -1, 1)
+    rows = 2 * points.shape[-2]
+    J = (by_ray @ D).reshape(len(R), rows, 6)
+    r = (by_ray @ (ray - rays)[..., None]).reshape(len(R), rows, 1)
     Jt = J.swapaxes(-1, -2)
     error = (r * r).sum(axis=(-1, -2))
     error[behind] = np.inf
@@ -160,7 +161,8 @@ def refine(
         p_new = p + step[:, 3:]
         error_new, H_new, g_new = _normal_equations(R_new, p_new, points, rays, by_ray)
         better = active & (error_new <= error)
-        active &= ~(better & (error - error_new < tolerance * (1 + error)))
+        gain = np.subtract(error, error_new, out=np.zeros_like(error), where=better)
+        active &= ~(better & (gain < tolerance * (1 + error)))
         for old, new in ((R, R_new), (p, p_new), (error, error_new), (H, H_new), (g, g_new)):
             old[better] = new[better]
         damping *= np.where(better, 0.1, 10.0)

@@ -21,6 +21,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, OutputPort
 
 from systems.cameras import PinholeCamera
+from systems.markers.corner_noise import corner_deviation, narrow_side
 from systems.markers.family import Family
 from systems.markers.layout import MarkerMap, marker_corners
 from systems.messages import Detections
@@ -51,7 +52,8 @@ class ProjectorParameters:
     degrees of tilt at 80 px.
 
     Attributes:
-        pixel_noise: standard deviation of each corner coordinate, px.
+        pixel_noise: standard deviation of each corner coordinate of a large marker, px.
+        pixel_noise_by_side: more noise of small ones, px^2 (see `systems.markers.corner_noise`).
         min_side_px: the narrow side below which a marker is not found, px (see
             `narrow_side`).
         max_incidence: angle between the marker's normal and the line of sight beyond which it is
@@ -63,6 +65,7 @@ class ProjectorParameters:
     """
 
     pixel_noise: float = 0.3
+    pixel_noise_by_side: float = 0.0
     min_side_px: float = 12.0
     max_incidence: float = 1.4
     max_range: float = math.inf
@@ -73,6 +76,7 @@ class ProjectorParameters:
     def __post_init__(self) -> None:
         require_non_negative(
             pixel_noise=self.pixel_noise,
+            pixel_noise_by_side=self.pixel_noise_by_side,
             min_side_px=self.min_side_px,
             white_margin=self.white_margin,
             border_px=self.border_px,
@@ -104,19 +108,6 @@ class VisibleMarkers:
     corners: Array
     side: Array
     incidence: Array
-
-
-def narrow_side(corners: Array) -> Array:
-    """Returns the narrow side of quadrilaterals (n, 4, 2) px: (n,) px.
-
-    That is the smaller singular value of the affine map that takes the unit square to the corners
-    best. A square seen straight on has its side; one that is tilted has its side times the cosine
-    of the tilt, whichever way it is turned. Detectors fail by this number.
-    """
-    # As complex numbers, the corners' first two Fourier coefficients are the two circles that the
-    # affine map turns a circle into; the ellipse's axes are their sum and difference.
-    points = np.ascontiguousarray(corners).view(complex)[:, :, 0]
-    return np.abs(np.abs(points @ _TURN) - np.abs(points @ _TURN.conj())) / 2
 
 
 @lru_cache(maxsize=16)
@@ -192,23 +183,6 @@ def visible_markers(
     return VisibleMarkers(index, pixels[keep, :4], side[keep], incidence)
 
 
-def corner_deviation(
-    side: Array,
-    incidence: Array,  # noqa: ARG001 - a detector may depend on it
-    parameters: ProjectorParameters,
-) -> Array:
-    """Returns the standard deviation of the corners of markers: (n,) px for each coordinate.
-
-    Constant for now: this is the place for a detector whose noise depends on how it sees a marker.
-
-    Args:
-        side: (n,) narrow side, px.
-        incidence: (n,) rad.
-        parameters: the constant.
-    """
-    return np.full(len(side), parameters.pixel_noise)
-
-
 def project_markers(
     *,
     camera: PinholeCamera,
@@ -248,7 +222,9 @@ def project_markers(
         parameters=parameters,
         solids=solids,
     )
-    deviation = corner_deviation(visible.side, visible.incidence, parameters)
+    deviation = corner_deviation(
+        visible.corners, parameters.pixel_noise, parameters.pixel_noise_by_side
+    )
     corners = visible.corners + deviation[:, None, None] * noise[visible.index]
     found = found[visible.index]
     return visible.index[found], corners[found]

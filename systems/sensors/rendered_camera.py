@@ -17,7 +17,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, InputPort, OutputPort
 
 from systems.cameras import PinholeCamera
-from systems.image_effects import ImageEffects, Lens, expose
+from systems.image_effects import ImageEffects, Lens, expose, linear_light
 from systems.markers.pnp import rotation_from_vector
 from systems.messages import CameraImage
 from systems.noise import NoiseStream
@@ -120,7 +120,7 @@ class RenderedCamera(SampledSensor):
     def _render(self, query: QueryObject, X_PC: RigidTransform) -> Image:
         rgba = query.RenderColorImage(self._render_camera, self._parent, X_PC).data
         code = cv2.COLOR_RGBA2GRAY if self._effects.grey else cv2.COLOR_RGBA2RGB
-        return self._lens(cv2.cvtColor(rgba, code))
+        return self._lens(linear_light(cv2.cvtColor(rgba, code)))
 
     def _moving(self, context: Context, query: QueryObject) -> Image:
         """Averages pictures over an exposure whose middle is now."""

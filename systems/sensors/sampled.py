@@ -13,6 +13,9 @@ from systems.noise import sample_index
 from systems.validation import require_non_negative, require_positive
 
 
+_SAME_TIME = 1e-9  # s; two sums of periods and latencies that mean one time differ by less
+
+
 class SampledSensor(LeafSystem):
     """Base of sensors that measure a message at `rate` and deliver it `latency` later.
 
@@ -69,14 +72,17 @@ class SampledSensor(LeafSystem):
         t = context.get_time()
         message = self._measure(context, whole_nanoseconds(t), sample_index(t, self.rate))
         slot = self._slot(state, self._under_way)
-        slot.set_value((*slot.get_value(), message))
+        slot.set_value((*slot.get_value(), (t + self.latency, message)))
         return EventStatus.Succeeded()
 
-    def _deliver(self, context: Context, state: State) -> EventStatus:  # noqa: ARG002 - Drake's
+    def _deliver(self, context: Context, state: State) -> EventStatus:
         slot = self._slot(state, self._under_way)
-        oldest, *others = slot.get_value()
-        slot.set_value(tuple(others))
-        self._slot(state, self._delivered).set_value(oldest)
+        under_way = slot.get_value()
+        # A simulation that starts late has deliveries before its first sample arrives.
+        if not under_way or under_way[0][0] > context.get_time() + _SAME_TIME:
+            return EventStatus.DidNothing()
+        self._slot(state, self._delivered).set_value(under_way[0][1])
+        slot.set_value(under_way[1:])
         return EventStatus.Succeeded()
 
     @staticmethod

@@ -19,12 +19,12 @@ from pydrake.systems.framework import Diagram, DiagramBuilder
 from systems.cameras import PinholeCamera
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap
+from systems.markers.corner_noise import narrow_side
 from systems.markers.projector import (
     MarkerProjector,
     PlacedMarker,
     ProjectorParameters,
     fold_radius,
-    narrow_side,
     placed_markers,
     project_markers,
     visible_markers,
