@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 import typing
 from dataclasses import dataclass, field
 from typing import Annotated, Any
@@ -30,6 +31,7 @@ from diagrams.schema import File, ScenarioError, file_path
 from diagrams.tables import Choice, Table
 from plants.arena import ArenaParameters, add_arena
 from plants.body_state import TwinPositions
+from plants.lighting import daylight
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap, load_map
@@ -312,10 +314,10 @@ class StationBuilder:
         """
         if self.scene_graph.HasRenderer(RENDERER):
             return
-        parameters = RenderEngineVtkParams()
+        # Without a display Linux renders through EGL; Drake's default serves the other platforms.
+        backend = {"backend": "EGL"} if sys.platform == "linux" else {}
+        parameters = RenderEngineVtkParams(lights=daylight(), **backend)
         try:
-            if hasattr(parameters, "backend") and not _on_mac():
-                parameters = RenderEngineVtkParams(backend="EGL")
             self.scene_graph.AddRenderer(RENDERER, MakeRenderEngineVtk(parameters))
         except RuntimeError as error:
             raise ScenarioError(
@@ -431,9 +433,3 @@ def _static_transforms(
         for frame, (robot, X_BC) in mountings.items()
     ]
     return {"/tf_static": ("tf2_msgs/msg/TFMessage", transforms_to_ros(transforms))}
-
-
-def _on_mac() -> bool:
-    import sys
-
-    return sys.platform == "darwin"

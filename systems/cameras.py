@@ -260,10 +260,9 @@ def camera_from_mapping(content: Any) -> PinholeCamera:
         require(model == "plumb_bob", "distortion_model", model, "plumb_bob")
         matrices = {}
         for name in ("camera_matrix", "distortion_coefficients"):
-            matrix = content.get(name)
-            require(
-                isinstance(matrix, dict) and "data" in matrix, name, matrix, "a mapping with data"
-            )
+            matrix: Any = content.get(name)
+            sound = isinstance(matrix, dict) and "data" in matrix
+            require(sound, name, matrix, "a mapping with data")
             matrices[name] = matrix["data"]
         content = {
             "width": content["image_width"],

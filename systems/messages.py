@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
@@ -32,9 +32,8 @@ class Message:
     """Base of all messages: freezes its arrays and is copied by reference."""
 
     def __post_init__(self) -> None:
-        for entry in fields(self):  # type: ignore[arg-type]  # subclasses are dataclasses
-            value = getattr(self, entry.name)
-            if isinstance(value, np.ndarray) and value.flags.writeable:
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
                 value.setflags(write=False)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:

@@ -18,6 +18,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
 from plants.boards import add_board
+from plants.lighting import daylight
 from systems.cameras import PinholeCamera
 from systems.image_effects import ImageEffects, Lens, expose, linear_light
 from systems.markers.layout import MarkerMap
@@ -45,7 +46,7 @@ class Studio:
         self.effects = effects or ImageEffects()
         builder = DiagramBuilder()
         plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
-        parameters = RenderEngineVtkParams(backend="EGL")
+        parameters = RenderEngineVtkParams(backend="EGL", lights=daylight())
         scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(parameters))
         for marker in markers:
             add_board(

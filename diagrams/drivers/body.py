@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
+from pydrake.systems.framework import BasicVector
 from pydrake.systems.primitives import MatrixGain
 
 from diagrams.channels import truth_signal
@@ -62,9 +63,10 @@ class DifferentialDriveBody:
             )
             robot.wheel_speeds = servos.get_input_port()
         else:
-            twin = station.add(
-                KinematicDifferentialDrive(parameters=self.parameters), f"{robot.name}.twin"
-            )
+            twin = KinematicDifferentialDrive(parameters=self.parameters)
+            # Declared anew for its default value, which is where the robot starts.
+            twin.DeclareContinuousState(BasicVector(robot.start))
+            station.add(twin, f"{robot.name}.twin")
             robot.state = station.add(TwinState(), f"{robot.name}.state")
             for name in ("pose", "velocity"):
                 station.connect(twin.GetOutputPort(name), robot.state.GetInputPort(f"twin_{name}"))

@@ -130,6 +130,11 @@ def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
     return corrected, (P + P.T) / 2
 
 
+def _sound(z: Array, R: Array) -> bool:
+    """Whether a measurement is finite and claims no perfection: a variance of 0 means none given."""
+    return bool(np.isfinite(z).all() and np.isfinite(R).all() and (np.diag(R) > 0).all())
+
+
 class PlanarKalmanFilter(LeafSystem):
     """Estimates the planar pose from commanded speed, gyro and marker poses.
 
@@ -163,7 +168,7 @@ class PlanarKalmanFilter(LeafSystem):
         covariance (output, vector of 9): (3, 3) of the pose, row by row; 1e6 on the diagonal until
             the first marker pose.
         health (output, Health): marker poses accepted, refused by the gate, refused as ambiguous,
-            not finite; IMU samples and commands not finite.
+            not finite or without variances; IMU samples and commands not finite.
 
     Source: [NAV] 4.2. We differ in that marker poses carry their own covariance (unless
     `measurement_noise` is given), in the offset (`rebase`), and in the start at the first marker.
@@ -237,11 +242,11 @@ class PlanarKalmanFilter(LeafSystem):
             theta_imu += yaw_rate * self._dt
         else:
             counts["bad_imu"] += 1
+        v = self._command_input.Eval(context)[0]
+        if not np.isfinite(v):
+            counts["bad_command"] += 1
+            v = 0.0
         if P[0, 0] < UNKNOWN:
-            v = self._command_input.Eval(context)[0]
-            if not np.isfinite(v):
-                counts["bad_command"] += 1
-                v = 0.0
             x, P = predict(x, P, v, theta_imu + offset, self._dt, self._parameters)
         discrete_state.set_value(self._x, x)
         discrete_state.set_value(self._P, P.ravel())
@@ -259,7 +264,7 @@ class PlanarKalmanFilter(LeafSystem):
             if alternative.valid and alternative.stamp == marker_pose.stamp:
                 choices.append(alternative)
         measured = [self._measurement(choice) for choice in choices]
-        if not all(np.isfinite(z).all() and np.isfinite(R).all() for z, R in measured):
+        if not all(_sound(z, R) for z, R in measured):
             return "bad_marker_pose", x, P
         if P[0, 0] >= UNKNOWN:  # the first one: there is no prediction to choose by
             if marker_pose.ambiguous:

@@ -207,7 +207,7 @@ class MapLocalizer:
         values, counts = np.unique(ids, return_counts=True)
         once = np.isin(ids, values[counts == 1])  # two of one id: none can be told to be the real
         dropped["repeated_id"] += int((known & ~once).sum())
-        finite = np.isfinite(detections.corners).all(axis=(1, 2))
+        finite = np.asarray(np.isfinite(detections.corners).all(axis=(1, 2)))
         corners = np.where(finite[:, None, None], detections.corners, 0.0)
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
         large = sides >= self.parameters.min_side
@@ -239,28 +239,36 @@ class MapLocalizer:
         """Returns the best one or two minima over all markers and which markers they rest on.
 
         The pose that most markers agree on is found among the candidates, by a robust vote: a
-        marker that lies further off than `max_reprojection` counts as much as one that lies there.
+        marker that lies further off than a limit counts as much as one that lies there. From those
+        that agree the common pose is refined, until those used are those that agree with it.
         """
-        used = np.ones(len(view.index), bool)
         limit = self.parameters.max_reprojection
         # A marker's own pose, carried over to others, errs more than a common pose will: the vote
         # is four times as patient as the verdict.
         by_marker = view.errors_by_marker(R, p)
         votes = (np.minimum(by_marker, 4 * limit) ** 2).sum(axis=1)
-        if not np.isfinite(by_marker).any():
-            return PnpSolution(R[:0], p[:0], votes[:0], np.zeros((0, 6, 6))), used
         first = int(np.argmin(votes))
+        # Those that agree come first: one that was moved would draw the common pose away from them
+        # all, and it would then be a question of luck who lies furthest off.
+        used = by_marker[first] <= 4 * limit
+        if used.sum() < 2:
+            used[:] = True
         # The same marker's other pose leads to the other minimum, where there is one. The runner-up
         # of the vote need not: it may be another marker's idea of the first.
         start = np.array([first, first ^ 1])
-        solution = view.refine(R[start], p[start])
-        for _ in range(len(used) - 2):
-            by_marker = view.errors_by_marker(solution.R[:1], solution.p[:1])[0]
-            by_marker[~used] = -1.0
-            worst = int(np.argmax(by_marker))
-            if by_marker[worst] <= limit:
+        solution = view.select(used).refine(R[start], p[start])
+        for _ in range(len(used)):
+            best = int(np.argmin(solution.squared_error))
+            errors = view.errors_by_marker(solution.R[[best]], solution.p[[best]])[0]
+            agree = errors <= limit
+            if agree.sum() < 2:
+                if used.sum() == 2:
+                    break
+                agree = used.copy()
+                agree[np.argmax(np.where(used, errors, -1.0))] = False
+            if (agree == used).all():
                 break
-            used[worst] = False
+            used = agree
             solution = view.select(used).refine(solution.R, solution.p)
         return _distinct_best_first(solution), used
 

@@ -125,7 +125,7 @@ def refine(
     rays: Array,
     by_ray: Array,
     *,
-    iterations: int = 12,
+    iterations: int = 40,
     tolerance: float = 1e-6,
 ) -> PnpSolution:
     """Minimises the reprojection error of b problems by Levenberg-Marquardt, from given poses.
@@ -136,7 +136,8 @@ def refine(
         points: (b, m, 3) or (m, 3), in F, m.
         rays: (b, m, 2) or (m, 2), measured.
         by_ray: (b, m, 2, 2) or (m, 2, 2) derivative of the pixels by the rays, px.
-        iterations: at most so many steps.
+        iterations: at most so many steps; four or five do, unless the start lies on a saddle, as a
+            marker's second pose does where there is but one minimum.
         tolerance: a problem is done when a step lowers its error by less than this part of it,
             or by less than this, px^2.
 

@@ -12,7 +12,6 @@ from systems.messages import Message, whole_nanoseconds
 from systems.noise import sample_index
 from systems.validation import require_non_negative, require_positive
 
-
 _SAME_TIME = 1e-9  # s; two sums of periods and latencies that mean one time differ by less
 
 

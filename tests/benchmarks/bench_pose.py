@@ -31,9 +31,9 @@ X_BC = RigidTransform(
     RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])),
     [0.115, 0.0, 0.12],
 )
-EFFECTS = ImageEffects(gain=1.2, shot_noise=2.0, read_noise=1.0, focus_blur=0.5)
+EFFECTS = ImageEffects(shot_noise=2.0, read_noise=1.0, focus_blur=0.5)
 # Fitted to what the detector shows on pictures of Drake's renderer; a test holds them together.
-NOISE = LocalizerParameters(pixel_noise=0.017, pixel_noise_by_side=1.4)
+NOISE = LocalizerParameters(pixel_noise=0.011, pixel_noise_by_side=1.08)
 SIZE = 0.10  # m
 
 

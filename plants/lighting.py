@@ -1,0 +1,33 @@
+"""Light for rendered pictures: even enough that a marker is seen whichever way it faces."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pydrake.geometry import LightParameter
+
+_AZIMUTHS = np.radians([20.0, 110.0, 200.0, 290.0])  # askew, so that parallel walls differ
+_ELEVATION = np.radians(30.0)
+# Drake's renderer of glTF scenes divides by pi: this makes upright white paper 85 % of full white.
+_INTENSITY = 2.4
+
+
+def daylight() -> list[LightParameter]:
+    """Returns four lights from afar, all around, fixed in the world.
+
+    The renderer's own default is one lamp at the camera, which leaves whatever it does not face
+    black.
+    """
+    return [
+        LightParameter(
+            type="directional",
+            frame="world",
+            intensity=_INTENSITY,
+            direction=[
+                np.cos(azimuth) * np.cos(_ELEVATION),
+                np.sin(azimuth) * np.cos(_ELEVATION),
+                -np.sin(_ELEVATION),
+            ],
+        )
+        for azimuth in _AZIMUTHS
+    ]
