@@ -98,10 +98,10 @@ def _video(path: Path, prefix: str) -> Iterator[Picture]:
     try:
         count = 0
         while True:
-            stamp = video.get(cv2.CAP_PROP_POS_MSEC) / 1000
             there, image = video.read()
             if not there:
                 break
+            stamp = video.get(cv2.CAP_PROP_POS_MSEC) / 1000  # of the picture just read
             yield Picture(f"{prefix}{count:06d}.png", stamp, cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
             count += 1
     finally:

@@ -46,7 +46,8 @@ class ImageEffects:
     def __post_init__(self) -> None:
         for name in ("supersampling", "exposure_samples"):
             value = getattr(self, name)
-            require(1 <= value <= 64, name, value, "a whole number from 1 to 64")
+            whole = 1 <= value <= 64 and value == int(value)
+            require(whole, name, value, "a whole number from 1 to 64")
         require_positive(gain=self.gain, gamma=self.gamma)
         require_non_negative(
             exposure=self.exposure,

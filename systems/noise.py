@@ -9,6 +9,7 @@ is Philox (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011
 from __future__ import annotations
 
 import hashlib
+from functools import lru_cache
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
@@ -16,6 +17,7 @@ from pydrake.systems.framework import BasicVector, Context, LeafSystem
 from systems.validation import require
 
 
+@lru_cache(maxsize=1024)
 def stream_key(seed: int, name: str) -> int:
     """Returns the 128-bit key of the stream `name` under `seed` (any integer)."""
     digest = hashlib.blake2b(f"{seed}/{name}".encode(), digest_size=16).digest()

@@ -23,6 +23,7 @@ from systems.validation import require, require_non_negative, require_positive
 Array = NDArray[np.float64]
 
 _TAIL = 4.0
+_HOPELESS = 1000.0  # chi-square by which a second minimum cannot come near the first any more
 
 REASONS = ("unknown_id", "repeated_id", "too_small", "bad_corners", "outlier", "inconsistent")
 
@@ -109,6 +110,7 @@ class _View:
             self.points.reshape(-1, 3),
             self.rays.reshape(-1, 2),
             self.by_ray.reshape(-1, 2, 2),
+            hopeless=_HOPELESS,
         )
 
     def errors_by_marker(self, R: Array, p: Array) -> Array:
@@ -122,6 +124,11 @@ class _View:
             np.tile(self.by_ray, (b, 1, 1, 1)),
         )
         return np.sqrt(errors.reshape(b, n) / 4) * self.deviation
+
+    def agree(self, solution: PnpSolution, limit: float) -> NDArray[np.bool_]:
+        """Returns (n,) which markers lie within `limit` (px) of where the best minimum has them."""
+        best = [int(np.argmin(solution.squared_error))]
+        return np.asarray(self.errors_by_marker(solution.R[best], solution.p[best])[0] <= limit)
 
 
 class MapLocalizer:
@@ -238,39 +245,45 @@ class MapLocalizer:
     ) -> tuple[PnpSolution, NDArray[np.bool_]]:
         """Returns the best one or two minima over all markers and which markers they rest on.
 
-        The pose that most markers agree on is found among the candidates, by a robust vote: a
-        marker that lies further off than a limit counts as much as one that lies there. From those
-        that agree the common pose is refined, until those used are those that agree with it.
+        The pose that most markers agree on is found among the candidates by a robust vote, and
+        refined over all markers. When one of them then lies too far off, the search starts anew
+        from every candidate, each with those that agree with it, and the largest agreement wins.
         """
         limit = self.parameters.max_reprojection
         # A marker's own pose, carried over to others, errs more than a common pose will: the vote
         # is four times as patient as the verdict.
         by_marker = view.errors_by_marker(R, p)
-        votes = (np.minimum(by_marker, 4 * limit) ** 2).sum(axis=1)
-        first = int(np.argmin(votes))
-        # Those that agree come first: one that was moved would draw the common pose away from them
-        # all, and it would then be a question of luck who lies furthest off.
-        used = by_marker[first] <= 4 * limit
-        if used.sum() < 2:
-            used[:] = True
+        order = np.argsort((np.minimum(by_marker, 4 * limit) ** 2).sum(axis=1), kind="stable")
         # The same marker's other pose leads to the other minimum, where there is one. The runner-up
         # of the vote need not: it may be another marker's idea of the first.
-        start = np.array([first, first ^ 1])
-        solution = view.select(used).refine(R[start], p[start])
+        used = np.ones(len(view.index), bool)
+        first = int(order[0])
+        solution = view.refine(R[[first, first ^ 1]], p[[first, first ^ 1]])
+        if not view.agree(solution, limit).all():
+            trials = [
+                self._consensus(view, R[[k, k ^ 1]], p[[k, k ^ 1]], by_marker[k] <= 4 * limit)
+                for k in order
+            ]
+            agreements = [
+                ((used & view.agree(s, limit)).sum(), -s.squared_error.min()) for s, used in trials
+            ]
+            solution, used = trials[max(range(len(trials)), key=agreements.__getitem__)]
+        return _distinct_best_first(solution), used
+
+    def _consensus(
+        self, view: _View, R: Array, p: Array, used: NDArray[np.bool_]
+    ) -> tuple[PnpSolution, NDArray[np.bool_]]:
+        """Refines over the markers that agree, until those used are those that agree."""
+        if used.sum() < 2:
+            used = np.ones(len(used), bool)
+        solution = view.select(used).refine(R, p)
         for _ in range(len(used)):
-            best = int(np.argmin(solution.squared_error))
-            errors = view.errors_by_marker(solution.R[[best]], solution.p[[best]])[0]
-            agree = errors <= limit
-            if agree.sum() < 2:
-                if used.sum() == 2:
-                    break
-                agree = used.copy()
-                agree[np.argmax(np.where(used, errors, -1.0))] = False
-            if (agree == used).all():
+            agree = view.agree(solution, self.parameters.max_reprojection)
+            if agree.sum() < 2 or (agree == used).all():
                 break
             used = agree
             solution = view.select(used).refine(solution.R, solution.p)
-        return _distinct_best_first(solution), used
+        return solution, used
 
     def _estimate(
         self,

@@ -127,6 +127,7 @@ def refine(
     *,
     iterations: int = 40,
     tolerance: float = 1e-6,
+    hopeless: float = np.inf,
 ) -> PnpSolution:
     """Minimises the reprojection error of b problems by Levenberg-Marquardt, from given poses.
 
@@ -140,6 +141,8 @@ def refine(
             marker's second pose does where there is but one minimum.
         tolerance: a problem is done when a step lowers its error by less than this part of it,
             or by less than this, px^2.
+        hopeless: once the best problem is done, one whose error still exceeds that one's by more
+            than this is left where it is: for starts that compete for one pose.
 
     Returns:
         The local minima. A problem whose start has a point behind the camera keeps its start and
@@ -168,6 +171,9 @@ def refine(
             old[better] = new[better]
         damping *= np.where(better, 0.1, 10.0)
         active &= damping < _DAMPING_END
+        best = int(np.argmin(error))
+        if not active[best]:
+            active &= error <= error[best] + hopeless
     return PnpSolution(R, p, error, H)
 
 

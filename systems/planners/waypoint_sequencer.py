@@ -44,7 +44,9 @@ class WaypointSequencer(LeafSystem):
         super().__init__()
         waypoints = np.atleast_2d(np.asarray(waypoints, float))
         require(
-            waypoints.shape[1] == 2 and len(waypoints) > 0 and bool(np.isfinite(waypoints).all()),
+            waypoints.shape[1:] == (2,)
+            and waypoints.size > 0
+            and bool(np.isfinite(waypoints).all()),
             "waypoints",
             waypoints.tolist(),
             "a list of at least one [x, y]",

@@ -99,6 +99,9 @@ class Imu(LeafSystem):
             samples; zeros before the first.
 
     White noise of density d sampled at `rate` has the standard deviation d sqrt(rate).
+
+    Raises:
+        ValueError: rate, seed or position out of range.
     """
 
     def __init__(
@@ -117,7 +120,9 @@ class Imu(LeafSystem):
         self._bias = np.array([*p.gyro_bias, *p.accel_bias])
         self._deviation = np.repeat([p.gyro_noise_density, p.accel_noise_density], 3)
         self._deviation *= np.sqrt(rate)
-        self._p_BS = np.zeros(3) if p_BS is None else np.asarray(p_BS, float)
+        self._p_BS = np.zeros(3) if p_BS is None else np.array(p_BS, float)
+        sound = self._p_BS.shape == (3,) and bool(np.isfinite(self._p_BS).all())
+        require(sound, "p_BS", self._p_BS.tolist(), "three finite numbers (m)")
         self._noise = NoiseStream(self, seed=seed, name=name)
         self._pose_input = self.DeclareAbstractInputPort(
             "pose", AbstractValue.Make(RigidTransform())

@@ -75,10 +75,10 @@ def heading_rows(camera: PinholeCamera, draws: int = 300) -> Iterator[Row]:
         mask = np.array(accepted, bool)
         everything = np.degrees(_rms(np.array(errors)))
         taken = np.degrees(_rms(np.array(errors)[mask])) if mask.any() else np.nan
-        taken_bound = (
-            np.degrees(noise * _rms(np.array(bounds)[mask])) if mask.any() else np.nan
+        taken_bound = np.degrees(noise * _rms(np.array(bounds)[mask])) if mask.any() else np.nan
+        share = (
+            f"{mask.mean():.0%} accepted of {len(mask)}, bound {bound:.2f}, all {everything:.2f}"
         )
-        share = f"{mask.mean():.0%} accepted of {len(mask)}, bound {bound:.2f}, all {everything:.2f}"
         what = f"heading by one marker, tilt {low}-{high} deg"
         if low >= 30:
             yield Row(what, f"{taken:.2f} deg RMS ({share})", "< 1 deg", bool(taken < 1.0))
@@ -224,6 +224,4 @@ def _rms(values: Array) -> float:
 
 
 if __name__ == "__main__":
-    import sys
-    if sys.argv[1:]: show("x", heading_rows(load_camera(CAMERAS / "vga.yaml")))
-    else: show("Poses from markers", rows())
+    show("Poses from markers", rows())

@@ -115,6 +115,13 @@ def shown(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """Six seconds of `kinematic`, with Meshcat and its replay."""
     folder = tmp_path_factory.mktemp("shown")
     return _run(
-        folder, "--seed", "3", "--set", "sight=projected", "--set", "dynamics=kinematic",
-        "--duration", "6",
+        folder,
+        "--seed",
+        "3",
+        "--set",
+        "sight=projected",
+        "--set",
+        "dynamics=kinematic",
+        "--duration",
+        "6",
     )

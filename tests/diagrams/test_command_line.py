@@ -223,9 +223,7 @@ def test_results_that_cannot_be_written_are_refused(refuse: Refuse, workshop: Pa
     assert line == "results/scenario.yaml: Is a directory"
 
 
-def test_a_second_run_replaces_the_first_ones_results(
-    tagtrail: Callable, workshop: Path
-) -> None:
+def test_a_second_run_replaces_the_first_ones_results(tagtrail: Callable, workshop: Path) -> None:
     out = workshop / "out"
     longer = [*SHORT[:-1], "0.4"]
     assert tagtrail("run", "navigation", *longer, "--out", out).status == 1
@@ -276,9 +274,7 @@ def test_a_recording_without_a_needed_topic_is_refused(
         for record in BagReader(navigation.bag).records():
             if record.topic != "/robot/imu":
                 message = record.message()
-                writer.write(
-                    record.topic, message.__msgtype__, message, record.log_time * 1e-9
-                )
+                writer.write(record.topic, message.__msgtype__, message, record.log_time * 1e-9)
     line = refuse("run", "navigation", "--no-meshcat", "--play", "poor")
     assert line.startswith(f"recording {workshop / 'poor'}: lacks the topic /robot/imu; has ")
     assert "/robot/front_camera/detections" in line
@@ -291,9 +287,7 @@ def test_a_camera_file_of_another_size_than_the_recordings_is_refused(
         "width: 320\nheight: 240\nK: [250, 0, 160, 0, 250, 120, 0, 0, 1]\n"
     )
     camera = "robot.sensors.front_camera.calibration=small.yaml"
-    line = refuse(
-        "run", "navigation", "--no-meshcat", "--play", navigation.bag, "--set", camera
-    )
+    line = refuse("run", "navigation", "--no-meshcat", "--play", navigation.bag, "--set", camera)
     assert line == (
         f"camera file {workshop / 'small.yaml'} is for pictures of 320x240: "
         "/robot/front_camera/camera_info of the recording is of 640x480"
@@ -306,9 +300,7 @@ def test_a_recording_is_not_overwritten_by_its_own_playback(
     shutil.copytree(navigation.path, workshop / "copy")
     before = (workshop / "copy" / "bag" / "bag_0.mcap").read_bytes()
     for played in ("copy/bag", "copy/bag/bag_0.mcap"):
-        line = refuse(
-            "run", "navigation", "--no-meshcat", "--play", played, "--out", "copy"
-        )
+        line = refuse("run", "navigation", "--no-meshcat", "--play", played, "--out", "copy")
         assert line == "--out copy: holds the recording that is played"
     assert (workshop / "copy" / "bag" / "bag_0.mcap").read_bytes() == before
 
@@ -317,9 +309,7 @@ def test_a_recording_may_have_any_name(tagtrail: Callable, navigation, workshop:
     # YAML would take the first for a number and the second for a mapping.
     for name in ("20240131", "a: b, [c]"):
         shutil.copytree(navigation.bag, workshop / name)
-        result = tagtrail(
-            "run", "navigation", "--no-meshcat", "--duration", "0.2", "--play", name
-        )
+        result = tagtrail("run", "navigation", "--no-meshcat", "--duration", "0.2", "--play", name)
         assert result.status == 1, result.err
 
 
@@ -343,9 +333,7 @@ def test_markers_that_cannot_be_printed_are_refused(refuse: Refuse, workshop: Pa
     assert refuse("markers", "navigation.json", "-o", "nowhere/x.pdf") == (
         "nowhere/x.pdf: No such file or directory"
     )
-    (workshop / "empty.json").write_text(
-        json.dumps({"family": "36h11", "size": 0.1, "tags": []})
-    )
+    (workshop / "empty.json").write_text(json.dumps({"family": "36h11", "size": 0.1, "tags": []}))
     assert "must have at least one" in refuse("markers", "empty.json")
     content = json.loads(MAP.read_text()) | {"size": 3.0}
     for tag in content["tags"]:
@@ -396,9 +384,9 @@ def test_what_detect_cannot_do_is_refused(refuse: Refuse, workshop: Path) -> Non
     assert refuse("detect", "empty", "--family", "4x4_50").startswith(
         "empty: no pictures, videos or recordings in it"
     )
-    assert refuse("detect", "a.png", "--family", "4x4_51") == (
-        "marker family is '4x4_51': unknown; did you mean 'DICT_4X4_50'?"
-    ) or "unknown" in refuse("detect", "a.png", "--family", "4x4_51")
+    assert refuse("detect", "a.png", "--family", "tag36h12") == (
+        "marker family is 'tag36h12': unknown; did you mean 'tag36h11'?"
+    )
     assert refuse("detect", "a.png", "--family", "4x4_50", "--size", "-0.1") == (
         "size is -0.1: must be greater than 0"
     )

@@ -197,9 +197,7 @@ def test_a_rendered_run_sees_as_well(rendered: Any) -> None:
 # Many runs
 
 
-def test_the_saved_scenario_reproduces_the_run_bit_for_bit(
-    navigation: Any, tmp_path: Path
-) -> None:
+def test_the_saved_scenario_reproduces_the_run_bit_for_bit(navigation: Any, tmp_path: Path) -> None:
     # In another process, in another folder, with strings hashed otherwise.
     subprocess.run(
         [sys.executable, "-m", "tagtrail", "run", navigation.path / "scenario.yaml",

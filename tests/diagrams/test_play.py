@@ -52,9 +52,7 @@ def copy(source: Path, target: Path, *, shift: float = 0.0, leave_out: str = " "
             message = record.message()
             if shift and hasattr(message, "header"):
                 message.header.stamp.sec += round(shift)
-            writer.write(
-                record.topic, message.__msgtype__, message, record.log_time * 1e-9 + shift
-            )
+            writer.write(record.topic, message.__msgtype__, message, record.log_time * 1e-9 + shift)
     return target
 
 

@@ -153,7 +153,9 @@ def test_the_estimate_stands_where_the_run_had_it(shown: Any, probe: dict[float,
         assert found["ellipse"]["position"][:2] == pytest.approx([x, y], abs=0.02)
         a, b, _ = found["disc"]["scale"]
         assert 0.001 < b <= a < 0.3
-    travelled = np.subtract(probe[LATE]["estimate"]["position"], probe[EARLY]["estimate"]["position"])
+    travelled = np.subtract(
+        probe[LATE]["estimate"]["position"], probe[EARLY]["estimate"]["position"]
+    )
     assert np.linalg.norm(travelled) > 0.8
 
 

@@ -196,9 +196,7 @@ def test_an_existing_path_becomes_absolute(tmp_path: Path) -> None:
     (tmp_path / "bag").mkdir()
     place = Place(("recording",), folders=(tmp_path,))
     assert convert("bag", hint, place) == str((tmp_path / "bag").resolve())
-    assert complaint("gab", hint, place) == (
-        "recording is 'gab': there is no such file or folder"
-    )
+    assert complaint("gab", hint, place) == ("recording is 'gab': there is no such file or folder")
 
 
 def test_plain_data_are_what_a_file_can_hold() -> None:

@@ -14,7 +14,7 @@ from diagrams.scenario import load_scenario, save_scenario
 from diagrams.schema import Place, ScenarioError
 from diagrams.tables import Table
 
-CONTROLLER = '''
+CONTROLLER = """
 import numpy as np
 from pydrake.systems.framework import LeafSystem
 
@@ -51,7 +51,7 @@ class Inherited(LeafSystem):
 
 
 NOT_A_CLASS = 3
-'''
+"""
 
 
 @pytest.fixture(autouse=True)
@@ -73,9 +73,7 @@ def scene(tmp_path: Path) -> Callable[[str], Path]:
 
     def write(controller: str) -> Path:
         path = tmp_path / "scene.yaml"
-        path.write_text(
-            f"extends: navigation\nsight: projected\ncontroller:\n  {controller}\n"
-        )
+        path.write_text(f"extends: navigation\nsight: projected\ncontroller:\n  {controller}\n")
         return path
 
     return write
@@ -184,9 +182,7 @@ def test_the_saved_scenario_finds_the_class_from_anywhere(
     assert again.controller.arguments == scenario.controller.arguments
 
 
-def test_a_folder_may_stand_before_the_module(
-    scene: Callable[[str], Path], tmp_path: Path
-) -> None:
+def test_a_folder_may_stand_before_the_module(scene: Callable[[str], Path], tmp_path: Path) -> None:
     package = tmp_path / "lib" / "my_package"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text("")
@@ -233,7 +229,9 @@ class Numbers:
 
 
 class Block(LeafSystem):
-    def __init__(self, *, parameters: Numbers | None = None, rate: float = 10.0, unused: Any = None):
+    def __init__(
+        self, *, parameters: Numbers | None = None, rate: float = 10.0, unused: Any = None
+    ):
         super().__init__()
         self.parameters = parameters or Numbers()
         self.rate = rate

@@ -1,0 +1,108 @@
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import pytest
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
+
+from systems.messages import Message
+from systems.sensors.sampled import SampledSensor
+
+
+@dataclass(frozen=True, eq=False)
+class Reading(Message):
+    stamp: float = math.nan
+    index: int = -1
+
+
+class Clock(SampledSensor):
+    """Measures the time."""
+
+    def __init__(self, rate: float, latency: float) -> None:
+        super().__init__()
+        self.out = self._declare_sampling(
+            name="reading", rate=rate, latency=latency, nothing=Reading()
+        )
+
+    def _measure(self, context: Context, stamp: float, index: int) -> Reading:
+        assert abs(stamp - context.get_time()) < 1e-9
+        return Reading(stamp, index)
+
+
+def arrivals(rate: float, latency: float, start: float, end: float) -> list[tuple[float, Reading]]:
+    """The readings and when each arrived, to 1 ms."""
+    clock = Clock(rate, latency)
+    simulator = Simulator(clock)
+    context = simulator.get_mutable_context()
+    context.SetTime(start)
+    found: list[tuple[float, Reading]] = []
+    assert math.isnan(clock.out.Eval(context).stamp)
+    for k in range(round((end - start) * 1000)):
+        # Between the milliseconds, where nothing happens.
+        simulator.AdvanceTo(start + (k + 0.5) / 1000)
+        reading = clock.out.Eval(context)
+        if not found or reading is not found[-1][1]:
+            found.append((start + k / 1000, reading))
+    if math.isnan(found[0][1].stamp):
+        del found[0]
+    return found
+
+
+@pytest.mark.parametrize("latency", [0.0, 0.004, 0.02, 0.05, 0.1, 0.13])
+def test_every_reading_arrives_its_latency_later_in_order(latency: float) -> None:
+    rate = 50.0  # a period of 20 ms: up to seven are under way
+    found = arrivals(rate, latency, 0.0, 0.4)
+    assert [reading.index for _, reading in found] == list(range(len(found)))
+    assert len(found) == math.floor((0.3995 - latency) * rate) + 1
+    for arrived, reading in found:
+        assert reading.stamp == reading.index / rate
+        assert arrived == pytest.approx(reading.stamp + latency, abs=1e-9)
+
+
+def test_a_latency_of_whole_periods_arrives_on_time() -> None:
+    # 0.3 is not 3 times 0.1 in floating point.
+    for rate, latency in ((10.0, 0.3), (30.0, 0.1), (15.0, 0.2)):
+        for arrived, reading in arrivals(rate, latency, 0.0, 1.2):
+            assert 0 <= arrived - (reading.stamp + latency) + 1e-9 < 1.1e-3
+
+
+@pytest.mark.parametrize("start", [10.0, 0.013, 123.4567])
+def test_a_simulation_may_start_late(start: float) -> None:
+    found = arrivals(20.0, 0.13, start, start + 0.5)
+    first = math.ceil(start * 20.0 - 1e-9)
+    assert [reading.index for _, reading in found] == list(range(first, first + len(found)))
+    assert len(found) >= 6
+    for arrived, reading in found:
+        assert reading.stamp == pytest.approx(reading.index / 20.0)
+        assert arrived == pytest.approx(reading.stamp + 0.13, abs=1.1e-3)
+
+
+def test_stamps_are_what_a_recording_keeps() -> None:
+    for _, reading in arrivals(15.0, 0.0, 0.0, 1.0):
+        assert reading.stamp == round(reading.stamp * 1e9) / 1e9
+
+
+def test_contexts_do_not_share_what_is_under_way() -> None:
+    clock = Clock(50.0, 0.1)
+    first, second = Simulator(clock), Simulator(clock)
+    first.AdvanceTo(0.25)
+    second.AdvanceTo(0.11)
+    assert clock.out.Eval(first.get_context()).index == 7
+    assert clock.out.Eval(second.get_context()).index == 0
+    copy = Simulator(clock, first.get_context().Clone())
+    copy.AdvanceTo(0.29)
+    assert clock.out.Eval(copy.get_context()).index == 9
+    assert clock.out.Eval(first.get_context()).index == 7
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("rate", 0.0), ("rate", math.inf), ("latency", -0.1), ("latency", math.nan)],
+)
+def test_nonsense_is_refused(field: str, value: float) -> None:
+    arguments: dict[str, Any] = {"rate": 10.0, "latency": 0.0} | {field: value}
+    with pytest.raises(ValueError, match=f"{field} is {value}: must be "):
+        Clock(**arguments)
