@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import logging
+import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -183,15 +184,20 @@ def _progress() -> Iterator[Callable[[float, float], None]]:
     bar = Progress(
         TextColumn("{task.description}"),
         BarColumn(),
-        TextColumn("{task.completed:.1f} / {task.total:.1f}"),
         TimeElapsedColumn(),
         console=Console(stderr=True),
         transient=True,
         disable=not sys.stderr.isatty(),
     )
     with bar:
-        task = bar.add_task("running", total=None)
-        yield lambda done, whole: bar.update(task, completed=done, total=whole)
+        task = bar.add_task("", total=None)
+
+        def show(done: float, whole: float) -> None:
+            known = math.isfinite(whole)
+            text = f"{done:.1f} / {whole:.1f}" if known else f"{done:.0f}"
+            bar.update(task, completed=done, total=whole if known else None, description=text)
+
+        yield show
 
 
 def _print_report(report: dict[str, object]) -> None:

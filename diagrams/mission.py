@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from abc import abstractmethod
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,8 @@ class Wiring:
         for name in ("bag_0.mcap", "metadata.yaml"):
             (out / "bag" / name).unlink(missing_ok=True)
         if not wanted.bag:
+            with contextlib.suppress(OSError):  # not there, or something else is in it
+                (out / "bag").rmdir()
             return None
         signals = [s for s in self._signals if wanted.images or not s.port.endswith(".image")]
         rate = max(signal.rate for signal in signals)

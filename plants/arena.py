@@ -86,14 +86,28 @@ class ArenaParameters:
 def check_markers(arena: ArenaParameters, markers: MarkerMap) -> None:
     """Raises `ValueError` for a marker that lies inside a wall or on its very surface."""
     for marker in markers:
-        points = np.vstack([marker.corners(), marker.X_WM.translation()])
         for index, wall in enumerate(arena.walls):
-            gap = float(wall.distance(points).min())
+            gap = _gap(wall, marker)
             if gap < MARKER_CLEARANCE:
                 raise ValueError(
                     f"marker {marker.id} is {gap:.4f} m from walls[{index}]: must be at least "
                     f"{MARKER_CLEARANCE} m in front of it"
                 )
+
+
+def _gap(wall: Wall, marker: Marker) -> float:
+    """Returns how far a marker's square is from a wall's box, m; negative when they overlap.
+
+    That is along the axis that parts them best: normals, and normals of pairs of edges.
+    """
+    X_BM = wall.pose().inverse().multiply(marker.X_WM)
+    normal, *edges = X_BM.rotation().matrix().T
+    axes = np.vstack([np.eye(3), normal, *(np.cross(np.eye(3), edge) for edge in edges)])
+    lengths = np.linalg.norm(axes, axis=1, keepdims=True)
+    axes = (axes / np.maximum(lengths, 1e-9))[lengths[:, 0] > 1e-9]
+    reach = np.abs(axes) @ np.array([wall.length, wall.thickness, wall.height]) / 2
+    reach += np.abs(axes @ np.transpose(edges)).sum(axis=1) * marker.size / 2
+    return float((np.abs(axes @ X_BM.translation()) - reach).max())
 
 
 def check_free(arena: ArenaParameters, points: Array, radius: float, what: str) -> None:

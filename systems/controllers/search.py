@@ -65,7 +65,6 @@ class SearchWhenLost(LeafSystem):
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._covariance_input = self.DeclareVectorInputPort("covariance", 9)
         self._duration = self.DeclareDiscreteState([self._period])  # of being lost, s
-        self._counts = Counts(self, "lost")
         self.DeclarePeriodicDiscreteUpdateEvent(self._period, 0.0, self._look)
         self._command_output = self.DeclareVectorOutputPort(
             "command",
@@ -73,6 +72,7 @@ class SearchWhenLost(LeafSystem):
             self._calc_command,
             {self._command_input.ticket(), self.discrete_state_ticket(self._duration)},
         )
+        self._counts = Counts(self, "lost")
 
     def command_input_port(self) -> InputPort:
         """Returns the port of the controller's command."""

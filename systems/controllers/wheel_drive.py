@@ -77,13 +77,13 @@ class WheelDrive(LeafSystem):
         self._to_wheel_speeds = to_wheel_speeds
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._sent = self.DeclareDiscreteState(2)
-        self._counts = Counts(self, "bad_command")
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / p.rate, 0.0, self._sample)
         self._sent_output = self.DeclareStateOutputPort("sent", self._sent)
         ticket = {self.discrete_state_ticket(self._sent)}
         self._wheel_speeds_output = self.DeclareVectorOutputPort(
             "wheel_speeds", 2, self._calc_wheel_speeds, ticket
         )
+        self._counts = Counts(self, "bad_command")
 
     def command_input_port(self) -> InputPort:
         """Returns the port of the command."""

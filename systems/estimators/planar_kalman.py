@@ -131,7 +131,7 @@ def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
 
 
 def _sound(z: Array, R: Array) -> bool:
-    """Whether a measurement is finite and claims no perfection: a variance of 0 means none given."""
+    """Whether a measurement is finite and has variances; 0 is what many send who have none."""
     return bool(np.isfinite(z).all() and np.isfinite(R).all() and (np.diag(R) > 0).all())
 
 
@@ -190,10 +190,10 @@ class PlanarKalmanFilter(LeafSystem):
         self._P = self.DeclareDiscreteState((np.eye(3) * UNKNOWN).ravel())
         # The integrated gyro, its offset to theta, the stamp of the last marker pose looked at.
         self._memory = self.DeclareDiscreteState(np.array([0.0, 0.0, np.nan]))
-        self._counts = Counts(self, *REASONS)
         self.DeclarePeriodicDiscreteUpdateEvent(self._dt, 0.0, self._step)
         self._pose_output = self.DeclareStateOutputPort("pose", self._x)
         self._covariance_output = self.DeclareStateOutputPort("covariance", self._P)
+        self._counts = Counts(self, *REASONS)
 
     def command_input_port(self) -> InputPort:
         """Returns the port of the command as sent to the wheels."""

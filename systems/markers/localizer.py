@@ -56,9 +56,7 @@ class LocalizerParameters:
             max_reprojection=self.max_reprojection,
             ambiguity_ratio=self.ambiguity_ratio,
         )
-        require_non_negative(
-            min_side=self.min_side, pixel_noise_by_side=self.pixel_noise_by_side
-        )
+        require_non_negative(min_side=self.min_side, pixel_noise_by_side=self.pixel_noise_by_side)
         require(self.use in ("all", "best"), "use", self.use, "'all' or 'best'")
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,7 @@ from systems.markers.pnp import rotation_from_vector
 from systems.messages import CameraImage
 from systems.noise import NoiseStream
 from systems.sensors.sampled import SampledSensor
+from systems.validation import require
 
 Image = NDArray[np.uint8]
 
@@ -60,6 +63,10 @@ class RenderedCamera(SampledSensor):
 
     Pixels count from the centre of the first pixel (see `systems.cameras`). The world stands still
     during an exposure; the camera moves by its body's velocity.
+
+    Raises:
+        ValueError: rate, latency, clipping or seed out of range, or a distortion that cannot be
+            inverted in the picture.
     """
 
     def __init__(
@@ -78,6 +85,9 @@ class RenderedCamera(SampledSensor):
         frame_id: str = "camera",
     ) -> None:
         super().__init__()
+        near, far = clipping
+        sound = 0 < near < far and math.isfinite(far)
+        require(sound, "clipping", clipping, "two distances in metres, 0 < near < far")
         self._effects = effects or ImageEffects()
         self._lens = Lens(camera, self._effects.supersampling)
         self._parent = parent_frame

@@ -10,9 +10,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import pytest
 
 from diagrams import cli
+from systems.markers.family import family
 
 PROJECTED = ("--no-meshcat", "--set", "sight=projected")
 
@@ -81,6 +84,32 @@ def workshop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder that the test works in."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
+
+
+@pytest.fixture(scope="session")
+def picture() -> Callable[[Path], Path]:
+    """Writes a picture of 320x240 with a marker of DICT_4X4_50 in it."""
+
+    def write(path: Path) -> Path:
+        image = np.full((240, 320), 255, np.uint8)
+        cells = family("4x4_50").cell_image(3, margin=0)
+        image[60:120, 90:150] = np.kron(cells, np.ones((10, 10), np.uint8))
+        cv2.imwrite(str(path), image)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def write_scenario(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a scenario file; `extends: navigation` stands in its first line, unless told not."""
+
+    def write(text: str, name: str = "scene.yaml", extends: str | None = "navigation") -> Path:
+        path = tmp_path / name
+        path.write_text((f"extends: {extends}\n" if extends else "") + text)
+        return path
+
+    return write
 
 
 def _run(folder: Path, *arguments: str | Path) -> RunFolder:

@@ -1,19 +1,14 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-import cv2
-import numpy as np
 import pytest
 
 from systems.io.bag import BagReader, BagWriter
-from systems.markers.family import family
 from systems.markers.layout import load_map
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -21,70 +16,7 @@ MAP = ROOT / "diagrams" / "maps" / "navigation.json"
 SHORT = ("--no-meshcat", "--set", "sight=projected", "--duration", "0.2")
 
 Refuse = Callable[..., str]
-
-
-def terminal(
-    *arguments: str, cwd: Path, path: tuple[Path, ...] = ()
-) -> subprocess.CompletedProcess[str]:
-    """Runs the installed command as a user does, or the module where it is not installed."""
-    installed = Path(sys.executable).with_name("tagtrail")
-    program = [str(installed)] if installed.exists() else [sys.executable, "-m", "tagtrail"]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, (*path, ROOT)))}
-    return subprocess.run(
-        [*program, *arguments], cwd=cwd, env=environment, capture_output=True, text=True
-    )
-
-
-def error_line(finished: subprocess.CompletedProcess[str]) -> str:
-    """The one line of a refusal."""
-    assert finished.returncode == 2, finished
-    assert finished.stdout == ""
-    (line,) = finished.stderr.splitlines()
-    return line
-
-
-# In a terminal
-
-
-def test_the_installed_command_lists_the_scenarios_a_line_each(tmp_path: Path) -> None:
-    finished = terminal("list", cwd=tmp_path)
-    assert finished.returncode == 0
-    assert finished.stderr == ""
-    names = [line.split()[0] for line in finished.stdout.splitlines()]
-    bundled = sorted(path.stem for path in (ROOT / "diagrams" / "scenarios").glob("*.yaml"))
-    assert names == bundled
-    assert "navigation" in names
-
-
-def test_a_failed_run_ends_with_1_and_bad_input_with_2(tmp_path: Path) -> None:
-    failed = terminal("run", "navigation", *SHORT, cwd=tmp_path)
-    assert failed.returncode == 1, failed.stderr
-    assert failed.stderr == ""
-    assert "navigation: timeout" in failed.stdout
-    # Without --out the results lie where the last line says.
-    report = json.loads((tmp_path / "out" / "navigation" / "report.json").read_text())
-    assert report["outcome"] == "timeout"
-    refused = error_line(terminal("run", "navigation", "--set", "sihgt=projected", cwd=tmp_path))
-    assert refused == "tagtrail: --set sihgt: sihgt: unknown key; did you mean 'sight'?"
-
-
-@pytest.mark.parametrize("name", ["systems", "plants", "diagrams"])
-def test_a_strangers_package_of_one_of_our_names_is_named(tmp_path: Path, name: str) -> None:
-    stranger = tmp_path / "site"
-    (stranger / name).mkdir(parents=True)
-    (stranger / name / "__init__.py").write_text("class Diagram: pass\n")
-    line = error_line(terminal("list", cwd=tmp_path, path=(stranger,)))
-    assert line.startswith(f"tagtrail: the package {name!r} found at {stranger}")
-    assert line.endswith("install tagtrail into an environment of its own")
-
-
-def test_a_strangers_package_that_does_not_even_import_is_named(tmp_path: Path) -> None:
-    stranger = tmp_path / "site"
-    (stranger / "diagrams").mkdir(parents=True)
-    (stranger / "diagrams" / "__init__.py").write_text("import a_module_that_is_not_there\n")
-    line = error_line(terminal("list", cwd=tmp_path, path=(stranger,)))
-    assert line.startswith("tagtrail: the package 'diagrams' cannot be imported: ")
-    assert "a_module_that_is_not_there" in line
+Draw = Callable[[Path], Path]
 
 
 # Arguments
@@ -108,7 +40,7 @@ def test_arguments_that_make_no_sense_are_refused_in_one_line(
     assert words in refuse(*arguments)
 
 
-def test_help_shows_every_command(tagtrail: Callable) -> None:
+def test_help_shows_every_command(tagtrail: Callable[..., Any]) -> None:
     result = tagtrail("--help")
     assert result.status == 0
     for command in ("list", "run", "diagram", "markers", "detect"):
@@ -223,7 +155,9 @@ def test_results_that_cannot_be_written_are_refused(refuse: Refuse, workshop: Pa
     assert line == "results/scenario.yaml: Is a directory"
 
 
-def test_a_second_run_replaces_the_first_ones_results(tagtrail: Callable, workshop: Path) -> None:
+def test_a_second_run_replaces_the_first_ones_results(
+    tagtrail: Callable[..., Any], workshop: Path
+) -> None:
     out = workshop / "out"
     longer = [*SHORT[:-1], "0.4"]
     assert tagtrail("run", "navigation", *longer, "--out", out).status == 1
@@ -243,7 +177,7 @@ def test_a_second_run_replaces_the_first_ones_results(tagtrail: Callable, worksh
 
 
 def test_a_refused_run_leaves_the_last_ones_results(
-    refuse: Refuse, tagtrail: Callable, workshop: Path
+    refuse: Refuse, tagtrail: Callable[..., Any], workshop: Path
 ) -> None:
     tagtrail("run", "navigation", *SHORT, "--out", "out")
     before = {path: path.read_bytes() for path in (workshop / "out").rglob("*") if path.is_file()}
@@ -268,7 +202,7 @@ def test_what_is_no_recording_is_refused(refuse: Refuse, workshop: Path) -> None
 
 
 def test_a_recording_without_a_needed_topic_is_refused(
-    refuse: Refuse, navigation, workshop: Path
+    refuse: Refuse, navigation: Any, workshop: Path
 ) -> None:
     with BagWriter(workshop / "poor") as writer:
         for record in BagReader(navigation.bag).records():
@@ -281,7 +215,7 @@ def test_a_recording_without_a_needed_topic_is_refused(
 
 
 def test_a_camera_file_of_another_size_than_the_recordings_is_refused(
-    refuse: Refuse, navigation, workshop: Path
+    refuse: Refuse, navigation: Any, workshop: Path
 ) -> None:
     (workshop / "small.yaml").write_text(
         "width: 320\nheight: 240\nK: [250, 0, 160, 0, 250, 120, 0, 0, 1]\n"
@@ -295,7 +229,7 @@ def test_a_camera_file_of_another_size_than_the_recordings_is_refused(
 
 
 def test_a_recording_is_not_overwritten_by_its_own_playback(
-    refuse: Refuse, navigation, workshop: Path
+    refuse: Refuse, navigation: Any, workshop: Path
 ) -> None:
     shutil.copytree(navigation.path, workshop / "copy")
     before = (workshop / "copy" / "bag" / "bag_0.mcap").read_bytes()
@@ -305,7 +239,9 @@ def test_a_recording_is_not_overwritten_by_its_own_playback(
     assert (workshop / "copy" / "bag" / "bag_0.mcap").read_bytes() == before
 
 
-def test_a_recording_may_have_any_name(tagtrail: Callable, navigation, workshop: Path) -> None:
+def test_a_recording_may_have_any_name(
+    tagtrail: Callable[..., Any], navigation: Any, workshop: Path
+) -> None:
     # YAML would take the first for a number and the second for a mapping.
     for name in ("20240131", "a: b, [c]"):
         shutil.copytree(navigation.bag, workshop / name)
@@ -316,7 +252,9 @@ def test_a_recording_may_have_any_name(tagtrail: Callable, navigation, workshop:
 # markers
 
 
-def test_markers_of_a_bundled_map_become_a_pdf(tagtrail: Callable, workshop: Path) -> None:
+def test_markers_of_a_bundled_map_become_a_pdf(
+    tagtrail: Callable[..., Any], workshop: Path
+) -> None:
     result = tagtrail("markers", "navigation.json", "-o", "sheets.pdf")
     assert result.status == 0, result.err
     data = (workshop / "sheets.pdf").read_bytes()
@@ -346,38 +284,7 @@ def test_markers_that_cannot_be_printed_are_refused(refuse: Refuse, workshop: Pa
 # detect
 
 
-def picture(path: Path, width: int = 320, height: int = 240) -> Path:
-    image = np.full((height, width), 255, np.uint8)
-    cells = family("4x4_50").cell_image(3, margin=0)
-    image[60:120, 90:150] = np.kron(cells, np.ones((10, 10), np.uint8))
-    cv2.imwrite(str(path), image)
-    return path
-
-
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("a.mp4", b"no video", "not a video that OpenCV can read"),
-        ("a.mkv", b"no video", "not a video that OpenCV can read"),
-        ("a.avi", b"", "not a video that OpenCV can read"),
-        ("a.png", b"no picture", "not a picture, or a damaged one"),
-        ("a.jpg", b"", "not a picture, or a damaged one"),
-        ("a.mcap", b"no recording", "not a recording (MCAP, rosbag2 or ROS 1 bag)"),
-        ("a.txt", b"no picture", "not a recording (MCAP, rosbag2 or ROS 1 bag)"),
-    ],
-)
-def test_a_source_that_is_not_what_its_name_says_is_refused_in_one_line(
-    tmp_path: Path, name: str, content: bytes, words: str
-) -> None:
-    # In a terminal: decoders write to the terminal themselves, past Python.
-    (tmp_path / name).write_bytes(content)
-    line = error_line(terminal("detect", name, "--family", "4x4_50", cwd=tmp_path))
-    assert line.startswith("tagtrail: ")
-    assert name in line
-    assert line.endswith(words)
-
-
-def test_what_detect_cannot_do_is_refused(refuse: Refuse, workshop: Path) -> None:
+def test_what_detect_cannot_do_is_refused(refuse: Refuse, picture: Draw, workshop: Path) -> None:
     picture(workshop / "a.png")
     (workshop / "empty").mkdir()
     assert refuse("detect", "nope", "--family", "4x4_50") == "nope: no such file or folder"
@@ -400,9 +307,9 @@ def test_what_detect_cannot_do_is_refused(refuse: Refuse, workshop: Path) -> Non
 
 
 def test_a_camera_file_of_another_size_than_the_pictures_is_refused(
-    refuse: Refuse, workshop: Path
+    refuse: Refuse, picture: Draw, workshop: Path
 ) -> None:
-    picture(workshop / "a.png", 320, 240)
+    picture(workshop / "a.png")
     (workshop / "vga.yaml").write_text(
         "width: 640\nheight: 480\nK: [500, 0, 320, 0, 500, 240, 0, 0, 1]\n"
     )
@@ -410,7 +317,9 @@ def test_a_camera_file_of_another_size_than_the_pictures_is_refused(
     assert line == "camera file vga.yaml is for pictures of 640x480: a.png is 320x240"
 
 
-def test_detect_does_not_write_over_the_pictures(refuse: Refuse, workshop: Path) -> None:
+def test_detect_does_not_write_over_the_pictures(
+    refuse: Refuse, picture: Draw, workshop: Path
+) -> None:
     (workshop / "pictures").mkdir()
     path = picture(workshop / "pictures" / "a.png")
     before = path.read_bytes()

@@ -4,19 +4,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import ArrayLike
 from scipy import stats
 
 from diagrams.metrics import NEES_BOUNDS, PoseLog, nees, path_length, pose_metrics
 from diagrams.trajectories import write_tum
 
 
-def log(truth, estimate, covariance=None, known=None) -> PoseLog:
-    truth, estimate = np.array(truth, float), np.array(estimate, float)
-    n = len(estimate)
+def log(
+    truth: ArrayLike,
+    estimate: ArrayLike,
+    covariance: ArrayLike | None = None,
+    known: ArrayLike | None = None,
+) -> PoseLog:
+    n = len(np.array(estimate))
     return PoseLog(
-        t=np.arange(n) * 0.1,
-        truth=truth,
-        estimate=estimate,
+        t=np.linspace(0.0, 1.0, n),
+        truth=np.array(truth, float),
+        estimate=np.array(estimate, float),
         covariance=np.tile(np.eye(3), (n, 1, 1)) if covariance is None else np.array(covariance),
         known=np.ones(n, bool) if known is None else np.array(known),
     )

@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -227,6 +228,13 @@ def test_another_seed_is_another_run(
     _, other = poses(tmp_path / "estimate.tum")
     _, first = poses(navigation.path / "estimate.tum")
     assert not np.allclose(other, first[: len(other)], atol=1e-5)
+    # Of every sensor, from its first sample on (of the gyro's port, the first value is zeros).
+    for topic, first_sample in (("/robot/imu", 1), ("/robot/front_camera/detections", 0)):
+        one, another = (
+            next(islice(BagReader(bag).records([topic]), first_sample, None)).data
+            for bag in (tmp_path / "bag", navigation.bag)
+        )
+        assert one != another, topic
 
 
 def test_a_shorter_run_is_the_beginning_of_a_longer_one(kinematic: Any, shown: Any) -> None:

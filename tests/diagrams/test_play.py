@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rosbags.rosbag2 import Reader
 
 from systems.io.bag import BagReader, BagWriter
 
@@ -169,3 +170,49 @@ def test_a_playback_is_recorded_like_a_run(navigation: Any, play: Play) -> None:
         again = [(r.log_time, r.data) for r in second.records([topic])]
         assert len(again) > 40
         assert again == [(r.log_time, r.data) for r in first.records([topic])][: len(again)]
+
+
+def test_a_run_is_recorded_in_ros_own_messages(navigation: Any, rendered: Any) -> None:
+    expected = {
+        "/robot/front_camera/camera_info": "sensor_msgs/msg/CameraInfo",
+        "/robot/front_camera/detections": "apriltag_msgs/msg/AprilTagDetectionArray",
+        "/robot/imu": "sensor_msgs/msg/Imu",
+        "/robot/drive/sent": "geometry_msgs/msg/Twist",
+        "/robot/estimate": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/truth/robot/pose": "geometry_msgs/msg/PoseStamped",
+        "/tf": "tf2_msgs/msg/TFMessage",
+        "/tf_static": "tf2_msgs/msg/TFMessage",
+    }
+    assert BagReader(navigation.bag).topics() == expected
+    pictures = {"/robot/front_camera/image/compressed": "sensor_msgs/msg/CompressedImage"}
+    assert BagReader(rendered.bag).topics() == expected | pictures
+
+
+def test_another_reader_reads_the_recording(navigation: Any) -> None:
+    # rosbags' own, which shares no code with our reader of MCAP.
+    with Reader(navigation.bag) as reader:
+        counts = {c.topic: c.msgcount for c in reader.connections}
+        seconds = reader.duration * 1e-9
+    assert seconds == pytest.approx(navigation.report["sim_seconds"], abs=0.05)
+    assert counts["/robot/imu"] == pytest.approx(100 * seconds, abs=3)
+    assert counts["/robot/front_camera/detections"] == pytest.approx(15 * seconds, abs=3)
+    assert counts["/robot/estimate"] == pytest.approx(50 * seconds, abs=3)
+    assert counts["/tf_static"] == counts["/robot/front_camera/camera_info"] == 1
+
+
+def test_the_transforms_place_robot_and_camera(navigation: Any) -> None:
+    bag = BagReader(navigation.bag)
+    ((_, _, static),) = bag.messages(["/tf_static"])
+    (mounting,) = static.transforms
+    assert mounting.header.frame_id == "robot/base_link"
+    assert mounting.child_frame_id == "robot/front_camera"
+    p, q = mounting.transform.translation, mounting.transform.rotation
+    assert (p.x, p.y, p.z) == pytest.approx((0.115, 0.0, 0.12))
+    # REP 103: z forward, x to the right, y down. Roll and yaw of -90 degrees.
+    assert np.sign(q.w) * np.array([q.w, q.x, q.y, q.z]) == pytest.approx([0.5, -0.5, 0.5, -0.5])
+    estimates = {t: m.pose.pose.position for _, t, m in bag.messages(["/robot/estimate"])}
+    for _, t, message in bag.messages(["/tf"]):
+        (transform,) = message.transforms
+        assert (transform.header.frame_id, transform.child_frame_id) == ("map", "robot/base_link")
+        assert transform.transform.translation.x == estimates[t].x
+        assert transform.transform.translation.y == estimates[t].y

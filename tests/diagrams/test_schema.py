@@ -79,9 +79,9 @@ def test_whole_numbers_are_numbers_but_nothing_else_is() -> None:
     assert isinstance(animal(legs=[{"length": 3}]).legs[0].length, float)
     for wrong in (True, "3", None, [3]):
         assert complaint({"length": wrong}, Leg) == f"length is {wrong!r}: must be a number"
-    for wrong in (3.0, True, "3"):
-        message = complaint({"length": 1, "joints": wrong}, Leg)
-        assert message == f"joints is {wrong!r}: must be a whole number"
+    for half in (3.0, True, "3"):
+        message = complaint({"length": 1, "joints": half}, Leg)
+        assert message == f"joints is {half!r}: must be a whole number"
     assert complaint({"length": 1, "stiff": 1}, Leg) == "stiff is 1: must be true or false"
     assert complaint({"name": 3}) == "name is 3: must be text"
 

@@ -68,7 +68,7 @@ def test_the_accelerometer_feels_the_second_derivative_of_its_own_path() -> None
     )
     A = np.concatenate([axis * 1.6, [-4 * np.sin(2 * t), 6 * t, -4.5 * np.cos(3 * t)]])
     R_BW = body(t).rotation().matrix().T
-    expected = [*(R_BW @ V[:3]), *(R_BW @ (acceleration + [0.0, 0.0, GRAVITY]))]
+    expected = [*(R_BW @ V[:3]), *(R_BW @ (acceleration + np.array([0.0, 0.0, GRAVITY])))]
     np.testing.assert_allclose(ideal_sample(body(t), V, A, p_BS), expected, atol=1e-5)
 
 

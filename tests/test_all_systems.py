@@ -1,0 +1,483 @@
+"""Every block of the house, held to what its docstring says of it.
+
+A new block needs an entry in `CASES`: a function that builds it and gives each input port a value,
+and another value that makes a difference.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import importlib
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.geometry import (
+    MakeRenderEngineVtk,
+    Meshcat,
+    MeshcatParams,
+    QueryObject,
+    RenderEngineVtkParams,
+)
+from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    LeafSystem,
+    PortDataType,
+)
+from ruamel.yaml import YAML
+
+import diagrams
+import plants
+import systems
+from diagrams.viewer import EstimateViewer
+from plants.boards import add_board
+from plants.body_state import BodyState, TwinPositions, TwinState
+from plants.differential_drive import (
+    DifferentialDriveParameters,
+    KinematicDifferentialDrive,
+    add_differential_drive,
+    wheel_speeds,
+)
+from systems.angles import spatial_pose
+from systems.cameras import PinholeCamera
+from systems.controllers.search import SearchWhenLost
+from systems.controllers.waypoints import WaypointController
+from systems.controllers.wheel_drive import WheelDrive
+from systems.estimators.planar_kalman import PlanarKalmanFilter
+from systems.image_effects import ImageEffects
+from systems.io.bag import BagWriter
+from systems.io.playback import Entry, MessagePlayback, VectorPlayback
+from systems.io.recorder import Channel, Recorder
+from systems.markers.detector import Detector, MarkerDetector
+from systems.markers.family import family
+from systems.markers.layout import Marker, MarkerMap
+from systems.markers.localizer import Localizer, LocalizerParameters, MapLocalizer
+from systems.markers.projector import MarkerProjector, placed_markers
+from systems.messages import CameraImage, Detections, Message, PoseEstimate
+from systems.planners.waypoint_sequencer import WaypointSequencer
+from systems.sensors.imu import Imu, ImuParameters
+from systems.sensors.rendered_camera import RenderedCamera
+
+# --- One of each, with inputs ---
+
+
+@dataclass
+class Case:
+    """A block and what its inputs are fixed to: by port, a value and another one."""
+
+    system: LeafSystem
+    inputs: dict[str, tuple[Any, Any]] = field(default_factory=dict)
+    close: Callable[[], Any] = lambda: None
+
+
+TAG = family("DICT_4X4_50")
+CAMERA = PinholeCamera.from_focal_length(160, 120, 140.0)
+# A camera in the world's origin that looks along x, and a marker 0.6 m before it.
+X_WC = RigidTransform(RollPitchYaw(-np.pi / 2, 0.0, -np.pi / 2), np.zeros(3))
+MAP = MarkerMap(TAG, 0.2, {7: Marker(7, spatial_pose(np.array([0.6, 0.0, np.pi - 0.5])), 0.2)})
+CORNERS = CAMERA.project(X_WC.inverse().multiply(MAP.corners(np.array([7]))[0].T).T)
+
+
+def scene(y: float) -> QueryObject:
+    """What SceneGraph says of the marker, moved aside by y."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
+    X_WM = RigidTransform([0.0, y, 0.0]) @ MAP.markers[7].X_WM
+    add_board(plant, plant.world_body(), X_WM, family=TAG, marker_id=7, size=0.2)
+    plant.Finalize()
+    parameters = RenderEngineVtkParams(backend="EGL")
+    scene_graph.AddRenderer("vtk", MakeRenderEngineVtk(parameters))
+    diagram = builder.Build()
+    context = diagram.CreateDefaultContext()
+    SCENES.append((diagram, context))  # the query object looks into them
+    return scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+
+
+SCENES: list[Any] = []
+WORLD = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.01)[1].world_frame_id()
+
+
+def detections(stamp: float, shift: float = 0.0) -> Detections:
+    return Detections(
+        stamp=stamp,
+        family=TAG.name,
+        ids=np.array([7]),
+        corners=CORNERS[None] + shift,
+        hamming=np.array([0]),
+        decision_margin=np.array([50.0]),
+    )
+
+
+def image(stamp: float) -> CameraImage:
+    cells = np.kron(TAG.cell_image(7, margin=2), np.ones((12, 12), np.uint8))
+    return CameraImage(stamp=stamp, data=cells)
+
+
+def marker_pose(x: float) -> PoseEstimate:
+    pose = RigidTransform([x, 0.0, 0.0])
+    return PoseEstimate(stamp=x, pose=pose, covariance=np.eye(6) * 1e-4, markers=1)
+
+
+def twin_positions(_: Path) -> Case:
+    plant = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.01)[0]
+    for name in ("blue", "red"):
+        add_differential_drive(plant, DifferentialDriveParameters(), name)
+    plant.Finalize()
+    poses = (np.array([1.0, 2.0, 0.3]), np.array([1.0, 2.0, 0.4]))
+    system = TwinPositions(plant=plant, models=["blue", "red"])
+    return Case(system, {"blue": poses, "red": poses})
+
+
+def recorder(folder: Path) -> Case:
+    channels = [
+        Channel("sample", "/imu", "sensor_msgs/msg/Imu", 6, 100.0),
+        Channel("found", "/tags", "apriltag_msgs/msg/AprilTagDetectionArray", Detections(), 10.0),
+    ]
+    system = Recorder(channels=channels, writer=BagWriter(folder / "bag"))
+    found = (detections(0.0), detections(0.1))
+    return Case(system, {"sample": (np.zeros(6), np.ones(6)), "found": found}, system.close)
+
+
+def viewer(_: Path) -> Case:
+    system = EstimateViewer(
+        meshcat=Meshcat(MeshcatParams(host="localhost")),
+        body=DifferentialDriveParameters(),
+        waypoints=np.zeros((1, 2)),
+        radius=0.3,
+        rate=10.0,
+    )
+    poses = (np.zeros(3), np.ones(3))
+    covariances = (0.01 * np.eye(3).ravel(), 0.02 * np.eye(3).ravel())
+    return Case(system, {"pose": poses, "covariance": covariances, "truth": poses})
+
+
+def vector(*first: float) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers, and larger ones."""
+    return np.array(first), np.array(first) * 1.1 + 0.05
+
+
+QUERIES = (scene(0.0), scene(0.05))
+POSES = (RigidTransform(), RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [1.0, 2.0, 3.0]))
+ESTIMATES = (marker_pose(0.5), marker_pose(0.51))
+
+CASES: dict[type, Callable[[Path], Case]] = {
+    BodyState: lambda _: Case(
+        BodyState(num_positions=7, num_velocities=6),
+        {
+            "state": vector(0.9, 0.1, 0.2, 0.3, *range(9)),
+            "generalized_acceleration": vector(*[1] * 6),
+        },
+    ),
+    Detector: lambda _: Case(
+        Detector(detector=MarkerDetector(family=TAG), rate=20.0),
+        {"image": (image(1.0), image(2.0))},
+    ),
+    EstimateViewer: viewer,
+    Imu: lambda _: Case(
+        Imu(parameters=ImuParameters(gyro_noise_density=0.01), p_BS=np.array([0.1, 0.0, 0.0])),
+        {
+            "pose": POSES,
+            "spatial_velocity": vector(0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
+            "spatial_acceleration": vector(0.6, 0.5, 0.4, 0.3, 0.2, 0.1),
+        },
+    ),
+    KinematicDifferentialDrive: lambda _: Case(
+        KinematicDifferentialDrive(), {"wheel_speeds": vector(3.0, 5.0)}
+    ),
+    Localizer: lambda _: Case(
+        Localizer(
+            localizer=MapLocalizer(
+                marker_map=MAP,
+                camera=CAMERA,
+                X_BC=X_WC,
+                parameters=LocalizerParameters(max_reprojection=50.0),  # there is an alternative
+            ),
+            rate=20.0,
+        ),
+        {"detections": (detections(1.0), detections(2.0, shift=0.5))},
+    ),
+    MarkerProjector: lambda _: Case(
+        MarkerProjector(
+            camera=CAMERA,
+            parent_frame=WORLD,
+            X_PC=X_WC,
+            markers=placed_markers(MAP, WORLD),
+            family=TAG,
+        ),
+        {"query_object": QUERIES},
+    ),
+    MessagePlayback: lambda _: Case(
+        MessagePlayback(
+            entries=[Entry(round(1e8 * k), 0.1 * k, detections(0.1 * k)) for k in range(5)],
+            nothing=Detections(),
+        )
+    ),
+    PlanarKalmanFilter: lambda _: Case(
+        PlanarKalmanFilter(),
+        {
+            "command": vector(0.3, 0.1),
+            "imu": vector(0.0, 0.0, 0.1, 0.0, 0.0, 9.81),
+            "marker_pose": ESTIMATES,
+            "marker_alternative": ESTIMATES,
+        },
+    ),
+    Recorder: recorder,
+    RenderedCamera: lambda _: Case(
+        RenderedCamera(
+            camera=CAMERA,
+            parent_frame=WORLD,
+            X_PC=X_WC,
+            renderer="vtk",
+            rate=15.0,
+            effects=ImageEffects(exposure_samples=2, read_noise=1.0),
+        ),
+        {"query_object": QUERIES, "spatial_velocity": vector(0, 0, 1, 0, 0, 0)},
+    ),
+    SearchWhenLost: lambda _: Case(
+        SearchWhenLost(),
+        {"command": vector(0.2, 0.1), "covariance": vector(*(0.01 * np.eye(3).ravel()))},
+    ),
+    TwinPositions: twin_positions,
+    TwinState: lambda _: Case(
+        TwinState(), {"twin_pose": vector(1.0, 2.0, 0.3), "twin_velocity": vector(0.3, 0.5)}
+    ),
+    VectorPlayback: lambda _: Case(
+        VectorPlayback(
+            entries=[Entry(round(1e8 * k), 0.1 * k, np.full(3, k)) for k in range(5)], size=3
+        )
+    ),
+    WaypointController: lambda _: Case(
+        WaypointController(), {"pose": vector(0.0, 0.0, 0.3), "goal": vector(0.1, 0.1)}
+    ),
+    WaypointSequencer: lambda _: Case(
+        WaypointSequencer(waypoints=np.array([[0.0, 0.0], [1.0, 0.0]])),
+        {"pose": vector(0.1, 0.0, 0.0)},
+    ),
+    WheelDrive: lambda _: Case(
+        WheelDrive(to_wheel_speeds=lambda c: wheel_speeds(c, DifferentialDriveParameters())),
+        {"command": vector(0.3, 0.2)},
+    ),
+}
+
+# --- What there is to be tested ---
+
+
+def all_systems() -> list[type]:
+    """Every concrete LeafSystem of ours; of a scalar-generic one, that for floats."""
+    for package in (systems, plants, diagrams):
+        for module in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
+            importlib.import_module(module.name)
+
+    def below(kind: type) -> Iterator[type]:
+        for child in kind.__subclasses__():
+            yield child
+            yield from below(child)
+
+    ours = {kind for kind in below(LeafSystem) if kind.__module__.split(".")[0] in HOUSE}
+    return sorted((kind for kind in ours if not is_abstract(kind)), key=name_of)
+
+
+HOUSE = ("systems", "plants", "diagrams")
+
+
+def is_abstract(kind: type) -> bool:
+    members = (getattr(kind, name, None) for name in dir(kind))
+    return any(getattr(member, "__isabstractmethod__", False) for member in members)
+
+
+def name_of(kind: type) -> str:
+    """The class' name, without the scalar type that Drake adds to a template's."""
+    return re.split(r"_\N{MATHEMATICAL BOLD SCRIPT CAPITAL T}", kind.__name__)[0]
+
+
+SYSTEMS = all_systems()
+
+
+@pytest.fixture
+def case(kind: type, tmp_path: Path) -> Iterator[Case]:
+    case = CASES[kind](tmp_path)
+    yield case
+    case.close()
+
+
+every_system = pytest.mark.parametrize("kind", [s for s in SYSTEMS if s in CASES], ids=name_of)
+
+
+def test_every_system_has_a_case() -> None:
+    missing = [f"{kind.__module__}.{name_of(kind)}" for kind in SYSTEMS if kind not in CASES]
+    assert not missing, (
+        f"no case for {', '.join(missing)}: add to CASES of {Path(__file__).name} a function that "
+        "returns Case(system, {input port: (value, another value)})"
+    )
+    gone = [name_of(kind) for kind in CASES if kind not in SYSTEMS]
+    assert not gone, f"CASES has {', '.join(gone)}, which no package of {HOUSE} defines"
+
+
+# --- Docstrings ---
+
+
+def sections(kind: type) -> dict[str, str]:
+    """The docstring's sections by heading: the drawn block, Args, Ports, ..."""
+    text = inspect.cleandoc(kind.__doc__ or "")
+    parts = re.split(r"^(\.\. pydrake_system::|[A-Z]\w+:)$", text, flags=re.MULTILINE)
+    return {
+        heading.strip(".: "): re.split(r"^\S", body, maxsplit=1, flags=re.MULTILINE)[0]
+        for heading, body in zip(parts[1::2], parts[2::2], strict=True)
+    }
+
+
+def entries(section: str) -> list[str]:
+    """What the entries of a section begin with: "name", or "name (kind)"."""
+    lines = inspect.cleandoc("\n" + section).splitlines()
+    return [line.split(":")[0] for line in lines if line and not line.startswith(" ")]
+
+
+def described_ports(kind: type) -> dict[tuple[str, str], str]:
+    """Direction and name of each port that the docstring describes, and what it says it carries."""
+    found = {}
+    for entry in entries(sections(kind).get("Ports", "")):
+        match = re.fullmatch(r"(\S+) \((input|output), (.+)\)", entry)
+        assert match, f"Ports: {entry!r} is not 'name (input or output, type)'"
+        found[match[2], match[1]] = match[3]
+    return found
+
+
+def stands_for(documented: list[str], names: list[str]) -> bool:
+    """Whether the drawn ports are these; what is no name, such as `{model}`, is any number."""
+    plain = [entry if re.fullmatch(r"\w+", entry) else "*" for entry in documented]
+    pattern = "".join(r"(\w+ )+" if entry == "*" else f"{entry} " for entry in plain)
+    pattern = re.sub(r"(\(\\w\+ \)\+)+", r"(\\w+ )+", pattern)
+    return re.fullmatch(pattern, "".join(f"{name} " for name in names)) is not None
+
+
+def ports(system: LeafSystem) -> dict[str, list[Any]]:
+    return {
+        "input": [system.get_input_port(i) for i in range(system.num_input_ports())],
+        "output": [system.get_output_port(i) for i in range(system.num_output_ports())],
+    }
+
+
+@every_system
+def test_the_drawn_block_has_the_declared_ports(kind: type, case: Case) -> None:
+    block = sections(kind).get("pydrake_system")
+    assert block, "the docstring lacks `.. pydrake_system::`"
+    drawn = YAML(typ="safe", pure=True).load(inspect.cleandoc(block))
+    assert drawn.pop("name") == name_of(kind)
+    for direction, declared in ports(case.system).items():
+        names = [port.get_name() for port in declared]
+        documented = drawn.pop(f"{direction}_ports", [])
+        assert stands_for(documented, names), f"{direction}_ports: {documented}, in fact {names}"
+    assert not drawn
+
+
+@every_system
+def test_every_port_is_described(kind: type, case: Case) -> None:
+    described = described_ports(kind)
+    for direction, declared in ports(case.system).items():
+        names = [port.get_name() for port in declared]
+        documented = [name for key, name in described if key == direction]
+        assert stands_for(documented, names), f"Ports: {direction}s {documented}, in fact {names}"
+        for port in declared:
+            said = described.get((direction, port.get_name()), "")
+            if match := re.fullmatch(r"vector of (\d+)", said):
+                assert port.get_data_type() == PortDataType.kVectorValued
+                assert port.size() == int(match[1]), f"{port.get_name()}: vector of {port.size()}"
+            elif direction == "input" and re.fullmatch(r"\w+", said):
+                assert said == type(case.inputs[port.get_name()][0]).__name__
+
+
+@every_system
+def test_every_argument_is_described(kind: type) -> None:
+    construct = getattr(kind, "_construct", kind.__init__)  # of a template, the former
+    parameters = list(inspect.signature(construct).parameters.values())[1:]
+    assert all(p.kind is p.KEYWORD_ONLY for p in parameters), "arguments are to be keyword-only"
+    names = [p.name for p in parameters if p.name != "converter"]
+    assert entries(sections(kind).get("Args", "")) == names
+
+
+# --- Behaviour ---
+
+
+def fix(case: Case, context: Context, *changed: str) -> None:
+    """Fixes the inputs; of the changed ports to the other value."""
+    for name, (value, other) in case.inputs.items():
+        case.system.GetInputPort(name).FixValue(context, other if name in changed else value)
+
+
+def simulate(case: Case, duration: float = 0.25) -> Context:
+    simulator = Simulator(case.system)
+    fix(case, simulator.get_mutable_context())
+    simulator.AdvanceTo(duration)
+    return simulator.get_context()
+
+
+def same(a: Any, b: Any) -> bool:
+    if isinstance(a, RigidTransform):
+        return a.IsExactlyEqualTo(b)
+    if isinstance(a, Message):
+        return type(a) is type(b) and all(
+            same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)
+        )
+    if isinstance(a, np.ndarray | float):
+        return np.array_equal(a, b, equal_nan=True)
+    return a == b
+
+
+def outputs(system: LeafSystem, context: Context) -> dict[str, Any]:
+    # Copies: what Eval returns is the cache's own, which changes with the inputs.
+    return {port.get_name(): copy.deepcopy(port.Eval(context)) for port in ports(system)["output"]}
+
+
+@every_system
+def test_it_steps_and_sends_what_it_says(kind: type, case: Case) -> None:
+    described = described_ports(kind)
+    for name, value in outputs(case.system, simulate(case)).items():
+        said = described["output", name]
+        if isinstance(value, np.ndarray):
+            assert said.startswith("vector of "), f"{name} is a vector, said to be {said}"
+            assert np.isfinite(value).all()
+        else:
+            assert said in (type(value).__name__, "of the type of `nothing`")
+
+
+@every_system
+def test_two_simulations_do_not_know_of_each_other(case: Case) -> None:
+    # State that is kept on the block instead of the Context would show.
+    first = outputs(case.system, simulate(case))
+    simulate(case, duration=0.1)
+    again = outputs(case.system, simulate(case))
+    for name, value in first.items():
+        assert same(value, again[name]), f"{name} differs in a second simulation"
+
+
+@every_system
+def test_direct_feedthrough_is_what_drake_says(case: Case) -> None:
+    context = simulate(case).Clone()
+    context.DisableCaching()  # else an undeclared dependence would not show
+    before = outputs(case.system, context)
+    inputs, declared = ports(case.system).values()
+    said = {
+        (given.get_name(), sent.get_name())
+        for given in inputs
+        for sent in declared
+        if case.system.HasDirectFeedthrough(given.get_index(), sent.get_index())
+    }
+    assert list(case.inputs) == [given.get_name() for given in inputs]
+    found = set()
+    for changed in case.inputs:
+        fix(case, context, changed)
+        after = outputs(case.system, context)
+        found |= {(changed, name) for name in before if not same(before[name], after[name])}
+    assert found <= said, f"changes an output at once, undeclared: {found - said}"
+    assert said <= found, f"declared, but changes nothing: {said - found}"
