@@ -201,8 +201,6 @@ class NavigationMission(Mission):
         write_tum(out / "estimate.tum", log.t[log.known], log.estimate[log.known])
         if log.truth is not None:
             write_tum(out / "truth.tum", log.t, log.truth)
-        if not log.known.any():
-            return  # nothing was ever estimated
         plot_navigation(
             out / "summary.png",
             log,

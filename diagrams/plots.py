@@ -48,7 +48,9 @@ def plot_navigation(
     left, right = cast(NDArray[Any], figure.subfigures(1, 2, width_ratios=[1.0, 1.05]))
     _plan(left.subplots(), log, waypoints, radius, walls, markers)
     axes = right.subplots(4 if log.truth is not None else 3, 1, sharex=True)
-    if log.truth is None:
+    if not log.known.any():
+        axes[0].set_title("no marker was ever seen: there is no estimate")
+    elif log.truth is None:
         _poses(axes, log)
     else:
         _errors(axes, log)
@@ -123,7 +125,8 @@ def _errors(axes: Array, log: PoseLog) -> None:
         )
         axes[k].set_ylim(-limit, limit)
     axes[0].legend(loc="upper right", fontsize=8, ncol=2)
-    axes[3].semilogy(t, np.maximum(nees(log.errors(), covariance), 1e-2), color="tab:red", lw=1.0)
+    normalised = np.clip(nees(log.errors(), covariance), 1e-2, 1e6)  # a log axis has no 0 and inf
+    axes[3].semilogy(t, normalised, color="tab:red", linewidth=1.0)
     for bound in NEES_BOUNDS:
         axes[3].axhline(bound, **_BOUND)
     axes[3].set_ylabel("NEES (3 dof)\nand 95 % bounds")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-
 from pydrake.geometry import LightParameter
 
 _AZIMUTHS = np.radians([20.0, 110.0, 200.0, 290.0])  # askew, so that parallel walls differ

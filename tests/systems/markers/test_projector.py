@@ -17,9 +17,9 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Diagram, DiagramBuilder
 
 from systems.cameras import PinholeCamera
+from systems.markers.corner_noise import narrow_side
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap
-from systems.markers.corner_noise import narrow_side
 from systems.markers.projector import (
     MarkerProjector,
     PlacedMarker,
