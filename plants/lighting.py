@@ -7,7 +7,8 @@ from pydrake.geometry import LightParameter
 
 _AZIMUTHS = np.radians([20.0, 110.0, 200.0, 290.0])  # askew, so that parallel walls differ
 _ELEVATION = np.radians(30.0)
-# Drake's renderer of glTF scenes divides by pi: this makes upright white paper 85 % of full white.
+# Drake's renderer of glTF scenes divides by pi: this makes upright white paper 67 to 91 % of full
+# white, by the way that it faces.
 _INTENSITY = 2.4
 
 

@@ -285,6 +285,18 @@ def test_a_marker_that_was_moved_is_left_out(moved: int, shift: list[float]) -> 
         assert found.pose.reprojection_rms < 1.0
 
 
+def test_two_of_six_that_were_moved_are_left_out() -> None:
+    surveyed, real = (map_of(SCENES["six about the room"]) for _ in range(2))
+    for k, shift in ((0, [0.0, 0.15, 0.0]), (4, [0.0, 0.0, 0.1])):
+        X_WM = surveyed.markers[k].X_WM
+        moved = RigidTransform(X_WM.rotation(), X_WM.translation() + shift)
+        real.markers[k] = Marker(k, moved, 0.1)
+    found = localizer(surveyed).locate(seen(pixels_of(real)))
+    assert dropped(found) == {"outlier": 2}
+    assert found.pose.markers == 4
+    np.testing.assert_allclose(error(found.pose.pose), 0.0, atol=1e-5)
+
+
 def test_two_markers_that_contradict_each_other_give_no_pose() -> None:
     surveyed = map_of(SCENES["two on a wall near by"])
     real = map_of([facing(1.2, 0.2, 0.2), facing(1.2, -0.35, 0.3)])
