@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -110,19 +109,6 @@ class VisibleMarkers:
     incidence: Array
 
 
-@lru_cache(maxsize=16)
-def fold_radius(camera: PinholeCamera) -> float:
-    """Returns how far from the axis (x/z, y/z) the camera's distortion model holds.
-
-    There its radial polynomial turns around and would fold points beside the camera back into the
-    picture; infinite for a model that does not.
-    """
-    k1, k2, _, _, k3 = camera.D
-    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0])  # of the slope, in the squared radius
-    folds = roots.real[(np.abs(roots.imag) < 1e-9) & (roots.real > 0)]
-    return float(np.sqrt(folds.min(initial=np.inf)))
-
-
 def visible_markers(
     *,
     camera: PinholeCamera,
@@ -163,7 +149,7 @@ def visible_markers(
     p_WQ = p_MQ @ X_WM[index, :, :3].transpose(0, 2, 1) + X_WM[index, None, :, 3]
     p_CQ = (p_WQ - p_WC) @ R_WC
     keep = (p_CQ[:, :, 2] > 0).all(axis=1)
-    fold = fold_radius(camera)
+    fold = camera.fold_radius
     if np.isfinite(fold):
         keep &= (np.hypot(p_CQ[:, :, 0], p_CQ[:, :, 1]) < fold * p_CQ[:, :, 2]).all(axis=1)
     index, p_WQ, p_CQ = index[keep], p_WQ[keep], p_CQ[keep]

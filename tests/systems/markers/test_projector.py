@@ -24,7 +24,6 @@ from systems.markers.projector import (
     MarkerProjector,
     PlacedMarker,
     ProjectorParameters,
-    fold_radius,
     placed_markers,
     project_markers,
     visible_markers,
@@ -225,7 +224,7 @@ def test_how_close_a_solid_may_be_grows_with_the_distance() -> None:
 def test_a_distorted_picture_does_not_fold_back() -> None:
     """Far off the axis the distortion model turns around: what is beside us would show ahead."""
     camera = PinholeCamera(640, 480, CAMERA.K, np.array([-0.4, 0.0, 0.0, 0.0, 0.0]))
-    fold = fold_radius(camera)
+    fold = camera.fold_radius
     assert fold == pytest.approx(np.sqrt(1 / 1.2))
     angles = np.linspace(0.05, 1.4, 60)
     beyond = 0
@@ -242,8 +241,8 @@ def test_a_distorted_picture_does_not_fold_back() -> None:
             assert len(index) == 1
             np.testing.assert_allclose(corners[0], by_opencv(AHEAD, X_WM, 0.1, camera), atol=1e-9)
     assert beyond > 3  # the trap was there
-    assert fold_radius(CAMERA) == np.inf
-    assert fold_radius(replace(CAMERA, D=np.array([0.1, 0.0, 0.01, 0.0, 0.0]))) == np.inf
+    assert CAMERA.fold_radius == np.inf
+    assert replace(CAMERA, D=np.array([0.1, 0.0, 0.01, 0.0, 0.0])).fold_radius == np.inf
 
 
 def test_noise_is_white_and_of_the_asked_size() -> None:
