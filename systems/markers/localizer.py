@@ -205,7 +205,7 @@ class MapLocalizer:
         return Localization(estimates[0], estimates[1] if len(estimates) > 1 else nothing, dropped)
 
     def _usable(self, detections: Detections, dropped: dict[str, int]) -> Detections:
-        """Returns the detections of markers that the map knows, counting the others."""
+        """Returns the detections that serve, the largest first, counting the others."""
         ids = detections.ids
         known = np.array([int(i) in self._index for i in ids], bool)
         dropped["unknown_id"] += int((~known).sum())
@@ -219,9 +219,8 @@ class MapLocalizer:
         dropped["bad_corners"] += int((known & once & ~finite).sum())
         dropped["too_small"] += int((known & once & finite & ~large).sum())
         seen = detections.select(known & once & finite & large)
-        if self.parameters.use == "best" and len(seen) > 1:
-            seen = seen.select(np.array([int(np.argmax(_areas(seen.corners)))]))
-        return seen
+        largest_first = np.argsort(-_areas(seen.corners), kind="stable")
+        return seen.select(largest_first[:1] if self.parameters.use == "best" else largest_first)
 
     def _candidates(self, R_CM: Array, p_CM: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
         """Returns `X_CW` by each marker's two poses: (2n, 3, 3) and (2n, 3)."""
@@ -243,24 +242,19 @@ class MapLocalizer:
     ) -> tuple[PnpSolution, NDArray[np.bool_]]:
         """Returns the best one or two minima over all markers and which markers they rest on.
 
-        The pose that most markers agree on is found among the candidates by a robust vote, and
-        refined over all markers. When one of them then lies too far off, the search starts anew
-        from every candidate, each with those that agree with it, and the largest agreement wins.
+        Both poses of the first and largest marker are refined over all markers. When one of them
+        then lies too far off, the search starts anew from every candidate, each with those that
+        agree with it, and the largest agreement wins.
         """
         limit = self.parameters.max_reprojection
-        # A marker's own pose, carried over to others, errs more than a common pose will: the vote
-        # is four times as patient as the verdict.
-        by_marker = view.errors_by_marker(R, p)
-        order = np.argsort((np.minimum(by_marker, 4 * limit) ** 2).sum(axis=1), kind="stable")
-        # The same marker's other pose leads to the other minimum, where there is one. The runner-up
-        # of the vote need not: it may be another marker's idea of the first.
         used = np.ones(len(view.index), bool)
-        first = int(order[0])
-        solution = view.refine(R[[first, first ^ 1]], p[[first, first ^ 1]])
+        # A marker's other pose leads to the other minimum, where there is one.
+        solution = view.refine(R[:2], p[:2])
         if not view.agree(solution, limit).all():
+            # A marker's own pose, carried over to others, errs more than a common pose will.
+            near = view.errors_by_marker(R, p) <= 4 * limit
             trials = [
-                self._consensus(view, R[[k, k ^ 1]], p[[k, k ^ 1]], by_marker[k] <= 4 * limit)
-                for k in order
+                self._consensus(view, R[[k, k ^ 1]], p[[k, k ^ 1]], near[k]) for k in range(len(R))
             ]
             agreements = [
                 ((used & view.agree(s, limit)).sum(), -s.squared_error.min()) for s, used in trials
