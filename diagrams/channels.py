@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from diagrams.schema import ScenarioError
-from systems.angles import planar_pose, spatial_pose
+from systems.angles import planar_pose
 from systems.io.bag import BagReader
 from systems.io.playback import MessagePlayback, VectorPlayback, read_channel
 from systems.io.recorder import Channel
@@ -19,8 +19,8 @@ from systems.io.ros_motion import (
     imu_to_ros,
     planar_estimate_from_ros,
     planar_estimate_to_ros,
+    planar_pose_to_ros,
     pose_from_ros,
-    pose_to_ros,
 )
 from systems.messages import CameraImage, Detections
 
@@ -149,7 +149,7 @@ def truth_signal(robot: str) -> Signal:
     return Signal(
         port=f"truth.{robot}.pose",
         topic=f"/truth/{robot}/pose",
-        encode=lambda value, t: pose_to_ros(spatial_pose(value), stamp=t, frame_id="map"),
+        encode=lambda value, t: planar_pose_to_ros(value, stamp=t, frame_id="map"),
         decode=lambda message: planar_pose(pose_from_ros(message)),
         model=3,
         rate=50.0,

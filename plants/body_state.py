@@ -80,8 +80,9 @@ class BodyState(LeafSystem):
         )
 
     def _calc_pose(self, context: Context, output: Any) -> None:
-        q = self._state_input.Eval(context)[:7]
-        output.set_value(RigidTransform(Quaternion(q[:4] / np.linalg.norm(q[:4])), q[4:]))
+        w, i, j, k, *p = self._state_input.Eval(context)[:7].tolist()
+        n = math.sqrt(w * w + i * i + j * j + k * k)
+        output.set_value(RigidTransform(Quaternion(w / n, i / n, j / n, k / n), p))
 
     def _calc_planar_pose(self, context: Context, output: Any) -> None:
         w, i, j, k, x, y = self._state_input.Eval(context)[:6].tolist()

@@ -159,13 +159,13 @@ class PinholeCamera:
                 distorted, jacobian = self._distort(guess)
                 error = target - distorted
                 size = np.abs(error).max(initial=0.0)
-                if size < 1e-12:
-                    break
                 a, b = jacobian[..., 0, 0], jacobian[..., 0, 1]
                 c, d = jacobian[..., 1, 0], jacobian[..., 1, 1]
                 ex, ey = error[..., 0], error[..., 1]
                 step = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
                 guess = guess + step / (a * d - b * c)[..., None]
+                if size < 1e-7:  # its square, which the step leaves, is below rounding
+                    break
             # Beyond the fold the same pixel has other rays too, some on the far side of the axis.
             right = np.hypot(guess[..., 0], guess[..., 1]) < self.fold_radius
             if not size < 1e-9:

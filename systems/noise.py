@@ -12,9 +12,12 @@ import hashlib
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
 from systems.validation import require
+
+_BLOCK = 64  # samples
 
 
 @lru_cache(maxsize=1024)
@@ -31,6 +34,13 @@ def generator(key: int, index: int) -> np.random.Generator:
     never overlap, however many are drawn for one.
     """
     return np.random.Generator(np.random.Philox(key=key, counter=index << 128))
+
+
+@lru_cache(maxsize=1024)
+def _block_of_normals(key: int, block: int, size: int) -> NDArray[np.float64]:
+    normals = generator(key, block).standard_normal((_BLOCK, size))
+    normals.setflags(write=False)
+    return normals
 
 
 def sample_index(t: float, rate: float) -> int:
@@ -54,5 +64,17 @@ class NoiseStream:
 
     def generator(self, context: Context, index: int) -> np.random.Generator:
         """Returns the random generator of sample `index`."""
-        seed = int(context.get_numeric_parameter(self._seed)[0])
-        return generator(stream_key(seed, self._name), index)
+        return generator(self._key(context), index)
+
+    def normals(self, context: Context, index: int, size: int) -> NDArray[np.float64]:
+        """Returns (size,) standard normal numbers of sample `index`, for a few at a high rate.
+
+        Those of many samples are drawn together: making a generator takes longer than using it.
+        A block draws either these or from `generator`.
+        """
+        block, row = divmod(index, _BLOCK)
+        numbers: NDArray[np.float64] = _block_of_normals(self._key(context), block, size)[row]
+        return numbers
+
+    def _key(self, context: Context) -> int:
+        return stream_key(int(context.get_numeric_parameter(self._seed)[0]), self._name)

@@ -6,6 +6,7 @@ lidar obstacle mapping".
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass
 
@@ -92,12 +93,12 @@ def predict(
     Returns:
         The predicted state and covariance.
     """
-    c, s = np.cos(x[2]), np.sin(x[2])
+    c, s = math.cos(x[2]), math.sin(x[2])
     F = np.array([[1.0, 0.0, -v * dt * s], [0.0, 1.0, v * dt * c], [0.0, 0.0, 1.0]])
     if not parameters.rebase:
         F[2, 2] = 0.0
     F_n = np.array([[c, 0.0], [s, 0.0], [0.0, 1.0]])
-    Q = np.array([parameters.speed_noise**2, parameters.heading_noise**2]) * dt  # diagonal
+    Q = np.array([parameters.speed_noise**2 * dt, parameters.heading_noise**2 * dt])  # diagonal
     predicted = np.array([x[0] + v * dt * c, x[1] + v * dt * s, wrap(theta)])
     return predicted, F @ P @ F.T + F_n * Q @ F_n.T
 
@@ -238,12 +239,12 @@ class PlanarKalmanFilter(LeafSystem):
             if verdict == "accepted" and self._parameters.rebase:
                 offset = wrap(float(x[2] - theta_imu))
         yaw_rate = self._imu_input.Eval(context)[2]
-        if np.isfinite(yaw_rate):
+        if math.isfinite(yaw_rate):
             theta_imu += yaw_rate * self._dt
         else:
             counts["bad_imu"] += 1
         v = self._command_input.Eval(context)[0]
-        if not np.isfinite(v):
+        if not math.isfinite(v):
             counts["bad_command"] += 1
             v = 0.0
         if P[0, 0] < UNKNOWN:

@@ -137,16 +137,9 @@ def planar_estimate_to_ros(
         stamp: s.
         frame_id: the frame that the pose is in.
     """
-    x, y, theta = np.asarray(pose, float).tolist()
     spatial = np.zeros((6, 6))
     spatial[_PLANAR] = covariance
-    message = message_class("geometry_msgs/msg/Pose")(
-        message_class("geometry_msgs/msg/Point")(x, y, 0.0),
-        message_class("geometry_msgs/msg/Quaternion")(
-            0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)
-        ),
-    )
-    return _with_covariance(stamp, frame_id, message, spatial.ravel())
+    return _with_covariance(stamp, frame_id, _planar_pose(pose), spatial.ravel())
 
 
 def planar_estimate_from_ros(message: Any) -> tuple[Array, Array]:
@@ -164,6 +157,13 @@ def planar_estimate_from_ros(message: Any) -> tuple[Array, Array]:
 def pose_to_ros(pose: RigidTransform, *, stamp: float, frame_id: str) -> Any:
     """Returns `geometry_msgs/msg/PoseStamped`."""
     return message_class("geometry_msgs/msg/PoseStamped")(header(stamp, frame_id), _pose(pose))
+
+
+def planar_pose_to_ros(pose: Array, *, stamp: float, frame_id: str) -> Any:
+    """Returns `geometry_msgs/msg/PoseStamped` of a planar pose (3,) [x (m), y (m), theta (rad)]."""
+    return message_class("geometry_msgs/msg/PoseStamped")(
+        header(stamp, frame_id), _planar_pose(pose)
+    )
 
 
 def pose_from_ros(message: Any) -> RigidTransform:
@@ -219,6 +219,16 @@ def _with_covariance(stamp: float, frame_id: str, pose: Any, covariance: Array) 
 def _pose(pose: RigidTransform) -> Any:
     position = message_class("geometry_msgs/msg/Point")(*pose.translation().tolist())
     return message_class("geometry_msgs/msg/Pose")(position, _quaternion(pose))
+
+
+def _planar_pose(pose: Array) -> Any:
+    x, y, theta = np.asarray(pose, float).tolist()
+    return message_class("geometry_msgs/msg/Pose")(
+        message_class("geometry_msgs/msg/Point")(x, y, 0.0),
+        message_class("geometry_msgs/msg/Quaternion")(
+            0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)
+        ),
+    )
 
 
 def _quaternion(pose: RigidTransform) -> Any:

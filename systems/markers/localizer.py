@@ -206,16 +206,16 @@ class MapLocalizer:
 
     def _usable(self, detections: Detections, dropped: dict[str, int]) -> Detections:
         """Returns the detections that serve, the largest first, counting the others."""
-        ids = detections.ids
-        known = np.array([int(i) in self._index for i in ids], bool)
+        ids = detections.ids.tolist()
+        known = np.array([i in self._index for i in ids], bool)
         dropped["unknown_id"] += int((~known).sum())
-        values, counts = np.unique(ids, return_counts=True)
-        once = np.isin(ids, values[counts == 1])  # two of one id: none can be told to be the real
+        # Of two of one id none can be told to be the real one.
+        once = np.array([ids.count(i) == 1 for i in ids], bool)
         dropped["repeated_id"] += int((known & ~once).sum())
         finite = np.asarray(np.isfinite(detections.corners).all(axis=(1, 2)))
         corners = np.where(finite[:, None, None], detections.corners, 0.0)
-        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).min(axis=1)
-        large = sides >= self.parameters.min_side
+        edges = corners - corners[:, [3, 0, 1, 2]]
+        large = (edges * edges).sum(axis=2).min(axis=1) >= self.parameters.min_side**2
         dropped["bad_corners"] += int((known & once & ~finite).sum())
         dropped["too_small"] += int((known & once & finite & ~large).sum())
         seen = detections.select(known & once & finite & large)
@@ -342,14 +342,14 @@ def _distinct_best_first(solution: PnpSolution) -> PnpSolution:
 
 def _areas(corners: Array) -> Array:
     """Returns (n,) areas of quadrangles (n, 4, 2)."""
-    x, y = corners[..., 0], corners[..., 1]
-    return np.abs((x * np.roll(y, -1, 1) - y * np.roll(x, -1, 1)).sum(axis=1)) / 2
+    # Half the cross product of the diagonals.
+    p, q = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
+    return np.asarray(np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]) / 2)
 
 
 def _orthonormal(R: Array) -> Array:
-    """Returns the rotation nearest to a product of many rotations."""
-    U, _, Vt = np.linalg.svd(R)
-    return U @ Vt
+    """Returns the rotation next to a product of many rotations, which rounding has bent."""
+    return 1.5 * R - 0.5 * R @ (R.T @ R)  # a Newton step toward the polar factor
 
 
 class Localizer(LeafSystem):

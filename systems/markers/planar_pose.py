@@ -19,6 +19,7 @@ from systems.markers.pnp import PnpSolution, refine, rotation_from_vector
 Array = NDArray[np.float64]
 
 SAME_POSE = 0.02  # rad; minima nearer to each other than this are one
+_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # the other two axes of each, in cyclic order
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,7 @@ def _two_rotations(H: Array) -> Array:
     J = H[:, :2, :2] - centre[:, :, None] * H[:, 2:, :2]
     # Rv turns the optical axis to the direction of the centre.
     direction = np.concatenate([centre, np.ones((len(H), 1))], axis=1)
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    direction /= np.sqrt((direction * direction).sum(axis=1, keepdims=True))
     x, y, z = direction.T
     Rv = np.empty((len(H), 3, 3))
     Rv[:, 0, 0] = 1 - x * x / (1 + z)
@@ -103,15 +104,17 @@ def _two_rotations(H: Array) -> Array:
     product = -(top[:, :, 0] * top[:, :, 1]).sum(axis=1)
     first, second = np.sqrt(rest).T
     second = np.where(product < 0, -second, second)
-    third = np.stack([first, second], axis=1)
-    rotations = np.empty((len(H), 2, 3, 3))
-    for k, sign in enumerate((1.0, -1.0)):
-        columns = np.concatenate([top, sign * third[:, None, :]], axis=1)
-        e1 = columns[:, :, 0] / np.linalg.norm(columns[:, :, 0], axis=1, keepdims=True)
-        e2 = columns[:, :, 1] - (columns[:, :, 1] * e1).sum(axis=1, keepdims=True) * e1
-        e2 /= np.linalg.norm(e2, axis=1, keepdims=True)
-        rotations[:, k] = Rv @ np.stack([e1, e2, np.cross(e1, e2)], axis=2)
-    return rotations
+    columns = np.empty((len(H), 2, 3, 3))
+    columns[:, :, :2, :2] = top[:, None]
+    columns[:, 0, 2, 0], columns[:, 0, 2, 1] = first, second
+    columns[:, 1, 2, :2] = -columns[:, 0, 2, :2]
+    # Gram and Schmidt: rounding has left the columns not quite orthonormal.
+    e1, e2, e3 = (columns[..., i] for i in range(3))
+    e1 /= np.sqrt((e1 * e1).sum(axis=-1, keepdims=True))
+    e2 -= (e2 * e1).sum(axis=-1, keepdims=True) * e1
+    e2 /= np.sqrt((e2 * e2).sum(axis=-1, keepdims=True))
+    e3[...] = e1[..., _NEXT] * e2[..., _AFTER] - e1[..., _AFTER] * e2[..., _NEXT]  # e1 x e2
+    return Rv[:, None] @ columns
 
 
 def _translations(R: Array, points: Array, rays: Array) -> Array:
@@ -236,6 +239,6 @@ def _twice_signed_areas(corners: Array) -> Array:
     All are positive for a convex marker seen from the front: clockwise in the picture, where y
     points down.
     """
-    ahead = np.roll(corners, -1, axis=1) - corners
-    behind = np.roll(corners, 1, axis=1) - corners
+    ahead = corners[:, [1, 2, 3, 0]] - corners
+    behind = -ahead[:, [3, 0, 1, 2]]
     return ahead[..., 0] * behind[..., 1] - ahead[..., 1] * behind[..., 0]

@@ -126,7 +126,7 @@ def refine(
     by_ray: Array,
     *,
     iterations: int = 40,
-    tolerance: float = 1e-6,
+    tolerance: float = 1e-8,
     hopeless: float = np.inf,
 ) -> PnpSolution:
     """Minimises the reprojection error of b problems by Levenberg-Marquardt, from given poses.
@@ -139,8 +139,8 @@ def refine(
         by_ray: (b, m, 2, 2) or (m, 2, 2) derivative of the pixels by the rays, px.
         iterations: at most so many steps; four or five do, unless the start lies on a saddle, as a
             marker's second pose does where there is but one minimum.
-        tolerance: a problem is done when a step lowers its error by less than this part of it,
-            or by less than this, px^2.
+        tolerance: a problem is done when a step promises to lower its error by less than this part
+            of it, or by less than this, px^2.
         hopeless: once the best problem is done, one whose error still exceeds that one's by more
             than this is left where it is: for starts that compete for one pose.
 
@@ -154,19 +154,19 @@ def refine(
     active = np.isfinite(error)
     diagonal = np.arange(6)
     for _ in range(iterations):
-        if not active.any():
-            break
         damped = H.copy()
         damped[:, diagonal, diagonal] *= 1 + damping[:, None]
         if not active.all():
             damped[~active] = np.eye(6)
         step = np.asarray(-np.linalg.solve(damped, g[..., None])[..., 0], np.float64)
+        # What the step would gain is known beforehand: the last look is spared.
+        active &= -(step * g).sum(axis=1) >= tolerance * (1 + error)
+        if not active.any():
+            break
         R_new = rotation_from_vector(step[:, :3]) @ R
         p_new = p + step[:, 3:]
         error_new, H_new, g_new = _normal_equations(R_new, p_new, points, rays, by_ray)
         better = active & (error_new <= error)
-        gain = np.subtract(error, error_new, out=np.zeros_like(error), where=better)
-        active &= ~(better & (gain < tolerance * (1 + error)))
         for old, new in ((R, R_new), (p, p_new), (error, error_new), (H, H_new), (g, g_new)):
             old[better] = new[better]
         damping *= np.where(better, 0.1, 10.0)

@@ -68,7 +68,7 @@ def ideal_sample(X_WB: RigidTransform, V_WB: Array, A_WB: Array, p_BS: Array) ->
     arm = R_WB @ p_BS
     acceleration = A_WB[3:] + (cross_matrix(A_WB[:3]) + W @ W) @ arm
     acceleration[2] += GRAVITY
-    return np.concatenate([V_WB[:3] @ R_WB, acceleration @ R_WB])
+    return (np.stack([V_WB[:3], acceleration]) @ R_WB).ravel()
 
 
 class Imu(LeafSystem):
@@ -157,5 +157,5 @@ class Imu(LeafSystem):
             self._p_BS,
         )
         index = sample_index(context.get_time(), self._rate)
-        noise = self._noise.generator(context, index).normal(size=6)
+        noise = self._noise.normals(context, index, 6)
         discrete_state.set_value(self._sample, ideal + self._bias + self._deviation * noise)

@@ -97,3 +97,22 @@ def test_the_largest_seeds_are_told_apart() -> None:
         return system.noise.generator(system.CreateDefaultContext(), 0).standard_normal()
 
     assert first(2**53 - 1) != first(2**53 - 2)
+
+
+def test_normals_depend_on_nothing_but_seed_and_sample() -> None:
+    system = Noisy(5)
+    context = system.CreateDefaultContext()
+    n = 4000
+    series = np.array([system.noise.normals(context, k, 2) for k in range(n)])
+    again = Noisy(5)
+    for k in (3999, 63, 64, 0):
+        found = again.noise.normals(again.CreateDefaultContext(), k, 2)
+        np.testing.assert_array_equal(found, series[k])
+    # White across the samples that are drawn together and those that are not.
+    assert np.abs(series.mean(axis=0)).max() < 5 / np.sqrt(n)
+    assert np.abs(series.std(axis=0) - 1).max() < 5 / np.sqrt(2 * n)
+    for lag in (1, 63, 64, 65, 128):
+        assert np.abs((series[lag:] * series[:-lag]).mean(axis=0)).max() < 5 / np.sqrt(n)
+    assert abs((series[:, 0] * series[:, 1]).mean()) < 5 / np.sqrt(n)
+    context.get_mutable_numeric_parameter(0).SetAtIndex(0, 6.0)
+    assert not np.array_equal(system.noise.normals(context, 0, 2), series[0])

@@ -100,7 +100,7 @@ def perturbed(R: np.ndarray, p: np.ndarray, seed: int = 5) -> tuple[np.ndarray, 
 @pytest.mark.parametrize("camera", [STRAIGHT, BARREL])
 def test_without_noise_the_true_pose_is_found(camera: PinholeCamera) -> None:
     R, p, points, pixels = random_problems(50, camera=camera)
-    solution = refine(*perturbed(R, p), points, *camera.rays(pixels))
+    solution = refine(*perturbed(R, p), points, *camera.rays(pixels), tolerance=1e-12)
     np.testing.assert_allclose(solution.R, R, atol=1e-7)
     np.testing.assert_allclose(solution.p, p, atol=1e-7)
     assert solution.squared_error.max() < 1e-8
