@@ -5,15 +5,16 @@ from __future__ import annotations
 import numpy as np
 from pydrake.geometry import LightParameter
 
-_AZIMUTHS = np.radians([20.0, 110.0, 200.0, 290.0])  # askew, so that parallel walls differ
+# Three lights light all upright faces nearly alike, the worst by 87 % of the best (four: 71 %).
+_AZIMUTHS = np.radians([0.0, 120.0, 240.0])
 _ELEVATION = np.radians(30.0)
-# Drake's renderer of glTF scenes divides by pi: this makes upright white paper 67 to 91 % of full
+# Drake's renderer of glTF scenes divides by pi: this makes upright white paper 78 to 91 % of full
 # white, by the way that it faces.
-_INTENSITY = 2.4
+_INTENSITY = 3.4
 
 
 def daylight() -> list[LightParameter]:
-    """Returns four lights from afar, all around, fixed in the world.
+    """Returns three lights from afar, all around, fixed in the world.
 
     The renderer's own default is one lamp at the camera, which leaves whatever it does not face
     black.

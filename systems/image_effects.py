@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.cameras import PinholeCamera
+from systems.noise import coarse_normals
 from systems.validation import require, require_non_negative, require_positive
 
 Image = NDArray[np.uint8]
@@ -124,10 +125,11 @@ def expose(image: Image, effects: ImageEffects, rng: np.random.Generator) -> Ima
     noisy = effects.shot_noise > 0 or effects.read_noise > 0
     if effects.gain == 1 and effects.gamma == 1 and not noisy:
         return image
-    light = image.astype(np.float32) * np.float32(effects.gain)
+    levels = np.arange(256, dtype=np.float32) * np.float32(effects.gain)
+    light = cv2.LUT(image, levels)
     if noisy:
-        variance = effects.read_noise**2 + effects.shot_noise**2 / 255 * light
-        light += np.sqrt(variance) * rng.standard_normal(light.shape, np.float32)
+        variance = effects.read_noise**2 + effects.shot_noise**2 / 255 * levels
+        light += cv2.LUT(image, np.sqrt(variance)) * coarse_normals(rng, light.shape)
     light = light.clip(0, 255)
     if effects.gamma != 1:
         light = 255 * (light / 255) ** np.float32(1 / effects.gamma)
@@ -141,9 +143,9 @@ def linear_light(image: Image) -> Image:
     our marker boards are. A sensor counts light.
 
     Args:
-        image: uint8, any shape.
+        image: uint8 (height, width) or (height, width, 3).
     """
-    return _LINEAR[image]
+    return cv2.LUT(image, _LINEAR)
 
 
 def _linear_table() -> Image:

@@ -33,7 +33,7 @@ X_BC = RigidTransform(
 )
 EFFECTS = ImageEffects(shot_noise=2.0, read_noise=1.0, focus_blur=0.5)
 # Fitted to what the detector shows on pictures of Drake's renderer; a test holds them together.
-NOISE = LocalizerParameters(pixel_noise=0.011, pixel_noise_by_side=1.08)
+NOISE = LocalizerParameters(pixel_noise=0.018, pixel_noise_by_side=1.05)
 SIZE = 0.10  # m
 
 

@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-import pytest
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -53,7 +52,7 @@ def test_upright_paper_is_lit_whichever_way_it_faces() -> None:
         white.append(light[31:33, 21:23].mean())
         black.append(light[31:33, 25].mean())
     # Paper is bright but nowhere clipped, and ink stays dark.
-    assert min(white) > 0.6
-    assert max(white) < 0.98
+    assert min(white) > 0.75
+    assert max(white) < 0.95
     assert max(black) < 0.06
-    assert np.mean(white) == pytest.approx(0.81, abs=0.05)
+    assert min(white) > 0.84 * max(white)  # three lights all around: cos 30 degrees

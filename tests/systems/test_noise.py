@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pydrake.systems.framework import LeafSystem
+from scipy import stats
 
-from systems.noise import NoiseStream, generator, sample_index, stream_key
+from systems.noise import NoiseStream, coarse_normals, generator, sample_index, stream_key
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -116,3 +117,17 @@ def test_normals_depend_on_nothing_but_seed_and_sample() -> None:
     assert abs((series[:, 0] * series[:, 1]).mean()) < 5 / np.sqrt(n)
     context.get_mutable_numeric_parameter(0).SetAtIndex(0, 6.0)
     assert not np.array_equal(system.noise.normals(context, 0, 2), series[0])
+
+
+def test_coarse_normals_are_normal() -> None:
+    numbers = coarse_normals(generator(1, 0), (301, 333))
+    assert numbers.shape == (301, 333)
+    n = numbers.size
+    result = stats.kstest(numbers.ravel(), "norm")
+    assert result.pvalue > 0.01
+    assert numbers.std() == pytest.approx(1.0, abs=4 / np.sqrt(2 * n))
+    # Neighbours, which share a word of the generator, have nothing to do with each other.
+    for lag in (1, 2, 3, 4):
+        flat = numbers.ravel()
+        assert abs((flat[lag:] * flat[:-lag]).mean()) < 4 / np.sqrt(n)
+    np.testing.assert_array_equal(coarse_normals(generator(1, 0), (301, 333)), numbers)
