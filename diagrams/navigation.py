@@ -89,9 +89,10 @@ class NavigationScenario(Scenario):
             have = ", ".join(fit) or "none"
             require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
         room = self.robot.body.build().hull_radius
-        check_free(self.world.arena, np.array(self.waypoints), room, "waypoints")
+        for k, point in enumerate(self.waypoints):
+            check_free(self.world.arena, point, room, f"waypoints[{k}]")
         start = self.robot.start
-        check_free(self.world.arena, np.array([[start.x, start.y]]), room, "robot.start")
+        check_free(self.world.arena, [start.x, start.y], room, "robot.start")
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:
         """Wires station, estimator and controller.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -110,24 +111,23 @@ def _gap(wall: Wall, marker: Marker) -> float:
     return float((np.abs(axes @ X_BM.translation()) - reach).max())
 
 
-def check_free(arena: ArenaParameters, points: Array, radius: float, what: str) -> None:
+def check_free(arena: ArenaParameters, point: Sequence[float], radius: float, what: str) -> None:
     """Raises `ValueError` for a point on the ground that has a wall within `radius`.
 
     Args:
         arena: the arena.
-        points: (n, 2) m.
+        point: (2,) m.
         radius: room that is needed, m.
-        what: name of the points for the message, `waypoints` for example.
+        what: name of the point for the message, `waypoints[0]` for example.
     """
-    for k, point in enumerate(np.atleast_2d(points)):
-        for index, wall in enumerate(arena.walls):
-            gap = float(wall.distance(np.array([[*point, wall.height / 2]]))[0])
-            if gap < radius:
-                where = "lies in" if gap < 0 else f"is {gap:.3f} m from"
-                raise ValueError(
-                    f"{what}[{k}] = [{point[0]:g}, {point[1]:g}] {where} walls[{index}]: the robot "
-                    f"needs {radius:.3f} m of room"
-                )
+    for index, wall in enumerate(arena.walls):
+        gap = float(wall.distance(np.array([[*point, wall.height / 2]]))[0])
+        if gap < radius:
+            where = "lies in" if gap < 0 else f"is {gap:.3f} m from"
+            raise ValueError(
+                f"{what} = [{point[0]:g}, {point[1]:g}] {where} walls[{index}]: the robot "
+                f"needs {radius:.3f} m of room"
+            )
 
 
 def add_arena(plant: MultibodyPlant, arena: ArenaParameters, markers: MarkerMap) -> None:

@@ -46,7 +46,7 @@ class PinholeCamera:
         require(self.height > 0, "height", self.height, "greater than 0")
         K = np.array(self.K, float)
         D = np.asarray(self.D, float).ravel()
-        require(K.size == 9, "K", self.K, "9 numbers, row by row")
+        require(K.size == 9, "K", K.tolist(), "9 numbers, row by row")
         K = K.reshape(3, 3)
         require(bool(np.isfinite(K).all()), "K", K.tolist(), "finite")
         require(K[0, 0] > 0 and K[1, 1] > 0, "K", K.tolist(), "of positive focal length")

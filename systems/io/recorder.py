@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.io.bag import BagWriter
 from systems.io.ros_messages import Encoder, encoder
-from systems.validation import require, require_non_negative, require_positive
+from systems.validation import require, require_positive
 
 _log = logging.getLogger(__name__)
 
@@ -31,7 +31,6 @@ class Channel:
         model: what the port carries: a number n for a vector of n, else an example of the message
             (`Detections()`, `RigidTransform()`).
         rate: how often the port is looked at, Hz.
-        offset: time of the first look, s.
         only_new: record only what has another stamp than the last one recorded; for messages with
             a stamp.
 
@@ -44,14 +43,12 @@ class Channel:
     encode: str | Encoder
     model: Any
     rate: float
-    offset: float = 0.0
     only_new: bool = False
 
     def __post_init__(self) -> None:
         require(bool(self.port), "port", self.port, "a name")
         require(self.topic.startswith("/"), "topic", self.topic, "absolute, such as /imu/data")
         require_positive(rate=self.rate)
-        require_non_negative(offset=self.offset)
         if self.is_vector:
             require(self.model > 0, "model", self.model, "a vector of at least one element")
         if self.only_new:
@@ -119,7 +116,7 @@ class Recorder(LeafSystem):
         self._warned: set[str] = set()
         # What the file holds already is the file's state, not the diagram's.
         self._written_stamps: dict[str, float] = {}
-        groups: dict[tuple[float, float], list[tuple[Channel, InputPort, Encoder]]] = {}
+        groups: dict[float, list[tuple[Channel, InputPort, Encoder]]] = {}
         for channel in channels:
             port = (
                 self.DeclareVectorInputPort(channel.port, channel.model)
@@ -127,12 +124,10 @@ class Recorder(LeafSystem):
                 else self.DeclareAbstractInputPort(channel.port, AbstractValue.Make(channel.model))
             )
             encode = encoder(channel.encode) if isinstance(channel.encode, str) else channel.encode
-            groups.setdefault((channel.rate, channel.offset), []).append((channel, port, encode))
+            groups.setdefault(channel.rate, []).append((channel, port, encode))
         self.DeclareInitializationPublishEvent(self._record_static)
-        for (rate, offset), group in groups.items():
-            self.DeclarePeriodicDiscreteUpdateEvent(
-                1.0 / rate, offset, partial(self._record, group)
-            )
+        for rate, group in groups.items():
+            self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, partial(self._record, group))
 
     @property
     def lost(self) -> int:

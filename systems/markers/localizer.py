@@ -207,7 +207,8 @@ class MapLocalizer:
     def _usable(self, detections: Detections, dropped: dict[str, int]) -> Detections:
         """Returns the detections that serve, the largest first, counting the others."""
         ids = detections.ids.tolist()
-        known = np.array([i in self._index for i in ids], bool)
+        ours = detections.family in ("", self.marker_map.family.name)
+        known = np.array([ours and i in self._index for i in ids], bool)
         dropped["unknown_id"] += int((~known).sum())
         # Of two of one id none can be told to be the real one.
         once = np.array([ids.count(i) == 1 for i in ids], bool)
@@ -371,7 +372,8 @@ class Localizer(LeafSystem):
             camera's.
 
     Ports:
-        detections (input, Detections): of the map's family.
+        detections (input, Detections): those of another family than the map's count as
+            `unknown_id`; without a family they count as the map's.
         pose (output, PoseEstimate): `X_WB` with covariance, of the latest picture; not `valid`
             (stamp NaN) when that shows no usable marker. `ambiguous` is set when the alternative
             is nearly as likely.

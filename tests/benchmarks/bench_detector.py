@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -19,6 +17,7 @@ from systems.markers.detector import MarkerDetector
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap, marker_corners
 from tests.benchmarks.table import Row, show
+from tests.recordings import FOLDER
 from tests.rendering import Studio
 from tests.synthetic import (
     CornerErrors,
@@ -38,7 +37,6 @@ Pictures = list[tuple[Grey, Array]]  # and the true corners of the markers 0, 1,
 
 ARUCO, APRILTAG = "DICT_4X4_50", "tag36h11"
 REFINEMENTS = {"NONE": 0, "SUBPIX": 1, "CONTOUR": 2, "APRILTAG": 3}  # cv2.aruco.CORNER_REFINE_*
-DATA = Path(os.environ.get("TAGTRAIL_DATA", Path(__file__).parents[3] / "shared" / "data"))
 
 
 def rows() -> Iterator[Row]:
@@ -207,7 +205,7 @@ def speed_rows() -> Iterator[Row]:
     """The block's time in units of its bare engine's, one thread, runs interleaved."""
     photographs = [
         cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-        for path in sorted((DATA / "apriltag_photos").glob("*.jpg"))
+        for path in sorted((FOLDER / "apriltag_photos").glob("*.jpg"))
     ]
     what = f"{len(photographs)} photographs, 799x533, 47 tags"
     if not photographs:

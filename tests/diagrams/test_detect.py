@@ -2,7 +2,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -19,6 +18,7 @@ from systems.io.ros_vision import camera_to_ros, image_to_ros
 from systems.markers.family import family
 from systems.markers.layout import marker_corners
 from systems.messages import CameraImage, Detections
+from tests.recordings import listed_tags, right_and_other
 from tests.synthetic import Sheet, draw, expose
 
 Array = NDArray[np.float64]
@@ -293,26 +293,17 @@ def test_the_tags_in_three_photographs(
     result = tagtrail("detect", photos, "--family", "36h11", "--out", tmp_path)
     assert (result.status, result.err) == (0, "")
     rows = table(tmp_path)
-    listed, matched, wrong = 0, 0, len(rows)
+    listed = 0
+    counts = np.zeros(2, int)
     for path in sorted(photos.glob("*.txt")):
         found = [row for row in rows if Path(row["image"]).stem == path.stem]
-        for line in path.read_text().splitlines():
-            numbers = [float(word) for word in re.findall(r"[\d.]+", line)]
-            marker, corners = int(numbers[0]), np.reshape(numbers[1:9], (4, 2)) - 0.5
-            listed += 1
-            # The list is without edge refinement and in an order of its own.
-            near = [
-                row
-                for row in found
-                if row["id"] == marker
-                and np.linalg.norm(np.mean(row["corners"], axis=0) - corners.mean(axis=0)) < 2.0
-            ]
-            assert len(near) <= 1
-            matched += len(near)
-            wrong -= len(near)
+        tags = listed_tags(path)
+        listed += len(tags)
+        ids, corners = [row["id"] for row in found], [row["corners"] for row in found]
+        counts += right_and_other(ids, corners, tags)
     assert listed == 47
-    assert matched >= 46
-    assert wrong == 0
+    assert counts[0] >= 46
+    assert counts[1] == 0
 
 
 @pytest.mark.recording

@@ -140,15 +140,15 @@ def test_no_marker_is_refused_that_has_room_and_none_accepted_that_has_not() -> 
 
 
 def test_points_without_room_are_refused_by_name() -> None:
-    free = np.array([[0.0, 0.0], [1.8, 0.0]])
-    check_free(ARENA, free, 0.17, "waypoints")
+    check_free(ARENA, [0.0, 0.0], 0.18, "waypoints[0]")
+    check_free(ARENA, [1.8, 0.0], 0.17, "waypoints[1]")
     with pytest.raises(
         ValueError,
         match=r"waypoints\[1\] = \[1\.8, 0\] is 0\.175 m from walls\[0\]: the robot needs 0\.180 m",
     ):
-        check_free(ARENA, free, 0.18, "waypoints")
-    with pytest.raises(ValueError, match=r"start\[0\] = \[0\.5, 1\.5\] lies in walls\[1\]"):
-        check_free(ARENA, np.array([0.5, 1.5]), 0.1, "start")
+        check_free(ARENA, [1.8, 0.0], 0.18, "waypoints[1]")
+    with pytest.raises(ValueError, match=r"start = \[0\.5, 1\.5\] lies in walls\[1\]"):
+        check_free(ARENA, [0.5, 1.5], 0.1, "start")
 
 
 def build(arena: ArenaParameters, markers: MarkerMap) -> Any:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -352,6 +353,7 @@ def test_without_a_usable_marker_there_is_no_pose() -> None:
     for detections, counts in (
         (seen(pixels[:0]), {}),
         (seen(pixels, [7, 8]), {"unknown_id": 2}),
+        (replace(seen(pixels), family="tag36h11"), {"unknown_id": 2}),
         (seen(pixels[:, ::-1]), {"bad_corners": 2}),
         (seen(pixels[:1, ::-1]), {"bad_corners": 1}),
     ):
