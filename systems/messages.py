@@ -132,6 +132,99 @@ class PoseEstimate(Message):
 
 
 @dataclass(frozen=True, eq=False)
+class Scan(Message):
+    """One turn of a lidar, like `sensor_msgs/LaserScan`.
+
+    Ray i points to angle_min + i angle_increment in the lidar's own frame (x forward, y left; the
+    angles grow to the left) and was measured at stamp + i time_increment.
+
+    Attributes:
+        stamp: time of the first ray, s; NaN when there is no scan.
+        frame_id: frame of the lidar.
+        angle_min: direction of the first ray, rad.
+        angle_increment: from one ray to the next, rad.
+        time_increment: from one ray to the next, s.
+        range_min: nearest distance that can be measured, m.
+        range_max: farthest, m.
+        ranges: (n,) m; inf where nothing was in reach, NaN where the measurement failed.
+    """
+
+    stamp: float = math.nan
+    frame_id: str = ""
+    angle_min: float = -math.pi
+    angle_increment: float = math.radians(1.0)
+    time_increment: float = 0.0
+    range_min: float = 0.0
+    range_max: float = math.inf
+    ranges: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __len__(self) -> int:
+        return len(self.ranges)
+
+    @property
+    def angles(self) -> Array:
+        """Directions of the rays in the lidar's frame, (n,) rad."""
+        return self.angle_min + self.angle_increment * np.arange(len(self.ranges), dtype=float)
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyGrid(Message):
+    """What is known of the ground around, like `nav_msgs/OccupancyGrid`, in log-odds.
+
+    Attributes:
+        stamp: time of the last scan that went in, s; NaN when there is no grid.
+        frame_id: the frame that the grid is aligned with.
+        resolution: side of a cell, m.
+        origin: (2,) the corner of cell (0, 0) with the least coordinates, m.
+        log_odds: (rows along y, columns along x) float32; 0 is unknown, above 0 rather occupied.
+    """
+
+    stamp: float = math.nan
+    frame_id: str = ""
+    resolution: float = 0.05
+    origin: Array = field(default_factory=lambda: np.zeros(2))
+    log_odds: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Path(Message):
+    """A way to go, like `nav_msgs/Path` without headings.
+
+    Attributes:
+        stamp: when it was planned, s; NaN when there is none yet.
+        frame_id: the frame that the points are in.
+        points: (n, 2) m, from the start to the goal; empty when there is no way.
+    """
+
+    stamp: float = math.nan
+    frame_id: str = ""
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class AvoiderState(Message):
+    """What an avoider sees and wants, for viewers, recordings and whoever decides to give up.
+
+    Attributes:
+        stamp: time of the scan that it rests on, s; NaN before the first.
+        status: `clear` (the way to the goal is free), `avoiding`, `turning` (no direction is free:
+            it turns in place to look for one), `blocked` (it has given up) or `blind` (no scan, or
+            none that can be used).
+        angles: (n,) middles of the sectors, in map, rad.
+        density: (n,) how full each sector is; the avoider's own scale.
+        free: (n,) bool, the sectors that it may choose.
+        direction: the chosen direction, in map, rad; NaN when there is none.
+    """
+
+    stamp: float = math.nan
+    status: str = "blind"
+    angles: Array = field(default_factory=lambda: np.zeros(0))
+    density: Array = field(default_factory=lambda: np.zeros(0))
+    free: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    direction: float = math.nan
+
+
+@dataclass(frozen=True, eq=False)
 class Health(Message):
     """What a block dropped and why, counted since the start.
 
