@@ -13,6 +13,7 @@ Array = NDArray[np.float64]
 
 # Two-sided 95 % bounds of chi-square with 3 degrees of freedom.
 NEES_BOUNDS = (0.2158, 9.3484)
+JERK_STEP = 0.1  # s
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +59,49 @@ def nees(errors: Array, covariance: Array) -> Array:
 def path_length(positions: Array) -> float:
     """Returns the length of a path (n, 2), m."""
     return float(np.linalg.norm(np.diff(positions, axis=0), axis=1).sum())
+
+
+def integrated_jerk(t: Array, positions: Array) -> float:
+    """Returns the integral of the squared linear jerk over a motion, m^2/s^5.
+
+    The third difference of positions that are `JERK_STEP` apart in time: slower changes than that
+    are what a passenger feels, faster ones are the contact's and the servo's.
+
+    Args:
+        t: (n,) s, ascending.
+        positions: (n, 2) m.
+    """
+    grid = np.arange(t[0], t[-1], JERK_STEP)
+    path = np.stack([np.interp(grid, t, positions[:, k]) for k in range(2)], axis=1)
+    jerk = np.diff(path, n=3, axis=0) / JERK_STEP**3
+    return float((jerk**2).sum() * JERK_STEP)
+
+
+def clearance_metrics(clearance: Array, contacts: Array) -> dict[str, float | int]:
+    """Returns `contacts`, `min_clearance_m` and `mean_clearance_m`.
+
+    Args:
+        clearance: (n,) from the robot's hull to the nearest obstacle, m; inf where there is none.
+        contacts: (n,) number of separate touches so far.
+    """
+    return {
+        "contacts": int(contacts[-1]),
+        "min_clearance_m": float(clearance.min()),
+        "mean_clearance_m": float(clearance.mean()),
+    }
+
+
+def nis_mean(nis: Array) -> float | None:
+    """Returns the mean normalised innovation squared per degree of freedom; 1 is right.
+
+    Args:
+        nis: (n, 2) logged output `nis` of an estimator: of the last update, and how many updates
+            there were so far. None when there was none.
+    """
+    new = np.flatnonzero(np.diff(nis[:, 1], prepend=0.0) > 0)
+    values = nis[new, 0]
+    values = values[np.isfinite(values)]
+    return float(values.mean()) if len(values) else None
 
 
 def pose_metrics(log: PoseLog) -> dict[str, float | None]:

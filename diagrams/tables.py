@@ -97,20 +97,24 @@ class Table:
         entries: name to "module:Class".
         resources: names of constructor arguments that the diagram provides.
         method: what every class of this kind has; it tells what cannot be one at all.
+        optional: whether the word `none` leaves the block out.
     """
 
     kind: str
     entries: Mapping[str, str]
     resources: frozenset[str] = frozenset()
     method: str = "GetOutputPort"
+    optional: bool = False
 
-    def convert(self, value: Any, place: Place) -> Choice:
-        """Resolves a block (see the module's docstring).
+    def convert(self, value: Any, place: Place) -> Choice | None:
+        """Resolves a block (see the module's docstring); None for one that is left out.
 
         Raises:
             ScenarioError: an unknown name or key, a class that cannot be imported, a value of the
                 wrong type, an argument that is missing.
         """
+        if self.optional and value in (None, "none", {"type": "none"}):
+            return None
         name_place = place
         if isinstance(value, str):
             value = {"type": value}
@@ -144,7 +148,7 @@ class Table:
         """Returns a name as `Choice.type` has it and its class (see `convert` for the errors)."""
         path = self.entries.get(name, name)
         if ":" not in path:
-            hint = nearest(name, self.entries)
+            hint = nearest(name, [*self.entries, *["none"] * self.optional])
             raise place.error(
                 f"{place} is {name!r}: no such {self.kind}; {hint} (or 'module:Class')"
             )

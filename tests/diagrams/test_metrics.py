@@ -7,7 +7,16 @@ import pytest
 from numpy.typing import ArrayLike
 from scipy import stats
 
-from diagrams.metrics import NEES_BOUNDS, PoseLog, nees, path_length, pose_metrics
+from diagrams.metrics import (
+    NEES_BOUNDS,
+    PoseLog,
+    clearance_metrics,
+    integrated_jerk,
+    nees,
+    nis_mean,
+    path_length,
+    pose_metrics,
+)
 from diagrams.trajectories import write_tum
 
 
@@ -109,3 +118,26 @@ def test_a_tum_file_holds_time_position_and_quaternion(tmp_path: Path) -> None:
     assert first == ["0.100000000", "1.000000000", "-2.000000000", *["0.000000000"] * 3, half, half]
     assert second[0] == "100000.020000000"
     assert np.abs(np.array(second[4:], float)) == pytest.approx([0.0, 0.0, 1.0, 0.0], abs=1e-9)
+
+
+def test_jerk_of_known_motions() -> None:
+    t = np.arange(0.0, 10.0, 0.02)
+    # x = sin 2t: the jerk is -8 cos 2t, its square 32 in the mean over whole periods.
+    swinging = np.stack([np.sin(2 * t), np.zeros_like(t)], axis=1)
+    mean = 32 + 32 * np.sin(4 * 10.0) / (4 * 10.0)
+    assert integrated_jerk(t, swinging) == pytest.approx(mean * 10.0, rel=0.06)
+    # Uniform acceleration has none, whichever way it goes.
+    falling = np.stack([0.3 * t - 0.05 * t**2, 0.1 * t**2], axis=1)
+    assert integrated_jerk(t, falling) == pytest.approx(0.0, abs=1e-12)
+    assert integrated_jerk(t[:3], falling[:3]) == 0.0  # too short to have one
+
+
+def test_clearance_and_contacts() -> None:
+    found = clearance_metrics(np.array([0.5, -0.01, 0.2, 0.31]), np.array([0.0, 1.0, 1.0, 1.0]))
+    assert found == {"contacts": 1, "min_clearance_m": -0.01, "mean_clearance_m": 0.25}
+
+
+def test_each_update_counts_once_in_the_nis() -> None:
+    nis = [[np.nan, 0], [0.5, 1], [0.5, 1], [1.5, 2], [1.5, 2], [4.0, 4]]
+    assert nis_mean(np.array(nis)) == pytest.approx(2.0)
+    assert nis_mean(np.array(nis[:1])) is None

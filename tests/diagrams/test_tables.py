@@ -266,3 +266,19 @@ def test_drakes_scalar_generic_systems_are_blocks_like_any_other() -> None:
     table = Table("controller", {"waypoint": "systems.controllers.waypoints:WaypointController"})
     choice = table.convert({"type": "waypoint", "k_a": 3}, Place())
     assert choice.build().parameters.k_a == 3.0
+
+
+def test_a_block_may_be_left_out_where_it_is_optional() -> None:
+    place = Place(("avoider",))
+    table = Table("avoider", {"sector": "systems.controllers.search:SearchWhenLost"}, optional=True)
+    for value in ("none", None, {"type": "none"}):
+        assert table.convert(value, place) is None
+    chosen = table.convert("sector", place)
+    assert chosen is not None
+    assert chosen.type == "sector"
+    with pytest.raises(ScenarioError, match=r"no such avoider; did you mean 'none'\?"):
+        table.convert("nome", place)
+    with pytest.raises(ScenarioError, match="no such estimator; known: kf"):
+        Table("estimator", {"kf": "systems.estimators.planar_kalman:PlanarKalmanFilter"}).convert(
+            "none", place
+        )
