@@ -1,12 +1,10 @@
 """Ray casting against the solids of a scene, which Drake itself does not offer.
 
-Every solid is convex, so a line runs inside it during one interval [enter, leave] of its length,
-and a ray from outside hits where it enters. An affine map leaves the length along a ray as it is
-and takes box, cylinder and ellipsoid (sphere) to unit shapes: the cube, cut by a ball in none, two
-or three of its dimensions. So they are one case, with the slabs of Kay and Kajiya ("Ray tracing
-complex scenes", SIGGRAPH 1986). Hulls are cut face by face (Cyrus and Beck, "Generalized two- and
-three-dimensional clipping", 1978). A ray is tried only against the solids whose bounding sphere it
-meets.
+A ray is tried only against the solids that it may meet. For a few rays and solids those are the
+ones whose bounding sphere it meets. Many rays from one place (or nearly) are sorted by their
+azimuth about the vertical: from there a solid is seen within an interval of azimuths, that of the
+corners of its bounding box. So the turn of a lidar, 360 rays among 100 solids, costs a thousand
+trials, not 36,000. What a trial does is in `systems.solid_shapes`.
 
 Touching a solid without entering it may count as a hit or as a miss: rounding decides.
 """
@@ -14,178 +12,48 @@ Touching a solid without entering it may count as a hit or as a miss: rounding d
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import (
-    Box,
-    Capsule,
-    Convex,
-    Cylinder,
-    Ellipsoid,
-    FrameId,
-    HalfSpace,
-    Mesh,
-    QueryObject,
-    Role,
-    SceneGraphInspector,
-    Shape,
-    Sphere,
-)
+from pydrake.geometry import FrameId, QueryObject, Role, SceneGraphInspector, Shape
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 
+from systems.solid_shapes import (
+    CAPSULE,
+    HULL,
+    ROUND_BOX,
+    TINY,
+    describe,
+    enter_box,
+    enter_capsule,
+    enter_hull,
+    enter_round_box,
+)
 from systems.validation import require
 
 Array = NDArray[np.float64]
-Interval = tuple[Array, Array]
+Index = NDArray[np.intp]
 
-# Stands for a divisor of zero: the result is then so large that any other bound wins.
-_TINY = 1e-200
-# In which dimensions a ball cuts the unit cube.
-_CUBE, _TUBE, _FULL = np.array([[0.0, 0, 0], [1, 1, 0], [1, 1, 1]])[:, :, None]
-_ROUND_BOX, _CAPSULE, _HULL = range(3)
-# A hull thinner than this part of its radius is a flat decal, which has no inside.
-_FLAT = 1e-5
-
-
-def _clip(enter: Array, leave: Array) -> Array:
-    """Returns where intervals begin; NaN for an empty one."""
-    return np.where(enter <= leave, enter, np.nan)
+# The corners of the unit cube.
+_CORNERS = np.array(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1])).reshape(3, 8).T
+# So many pairs of solids and rays are sooner tried each than sorted.
+_FEW = 12_000
+# Pairs that are tried at once: larger arrays go back to the system each time, and fetching them
+# anew takes a quarter longer.
+_BLOCK = 2000
+# Rounding must not turn away a ray that only just meets what holds a solid: part, and rad.
+_SLACK = 1e-9
 
 
-def _slabs(o: Array, d: Array) -> Interval:
-    """Returns where the lines `o + t d` run in |x| <= 1, component by component.
-
-    A line along the slab is in it from -inf to inf, or enters at inf.
-    """
-    a, b = (-1 - o) / d, (1 - o) / d
-    return np.minimum(a, b), np.maximum(a, b)
-
-
-def _ball(o: Array, d: Array, part: Array) -> Interval:
-    """Returns where the lines run in the unit ball, in those dimensions whose `part` is 1, not 0.
-
-    NaN for a miss. The distance is taken at the closest point, which keeps its digits when the
-    line starts far away.
-    """
-    d_part = part * d
-    square = np.maximum((d_part * d).sum(axis=0), _TINY)
-    middle = (d_part * o).sum(axis=0) / -square
-    closest = o + middle * d
-    half = np.sqrt((1 - (part * closest * closest).sum(axis=0)) / square)
-    return middle - half, middle + half
-
-
-def _enter_round_box(o: Array, d: Array, part: Array) -> Array:
-    """Returns where the lines enter the unit cube cut by a ball; NaN for a miss."""
-    near, far = _slabs(o, d)
-    enter, leave = _ball(o, d, part)
-    return _clip(np.maximum(enter, near.max(axis=0)), np.minimum(leave, far.min(axis=0)))
-
-
-def _enter_capsule(o: Array, d: Array, ratio: Array) -> Array:
-    """Returns where the lines enter a capsule of unit radius; NaN for a miss.
-
-    `ratio` is half the length of the straight part.
-    """
-    tube, _ = _ball(o, d, _TUBE)
-    # What enters the endless tube beyond the straight part can only come in through that cap.
-    height = o[2] + tube * d[2]
-    from_cap = o.copy()
-    from_cap[2] -= np.copysign(ratio, height)
-    cap, _ = _ball(from_cap, d, _FULL)
-    return np.where(np.abs(height) <= ratio, tube, cap)
-
-
-def _enter_hull(o: Array, d: Array, faces: Array, counts: NDArray[np.intp]) -> Array:
-    """Returns where the lines enter a hull; NaN for a miss.
-
-    Args:
-        o: (3, n) m, from the hull's centre.
-        d: (3, n).
-        faces: (4, sum of counts) those of all hulls in one row: normal, distance from the centre.
-        counts: (n,) how many belong to each line's hull.
-    """
-    line = np.repeat(np.arange(len(counts)), counts)
-    height = faces[3] - np.einsum("in,in->n", faces[:3], o.take(line, axis=1))
-    rise = np.einsum("in,in->n", faces[:3], d.take(line, axis=1))
-    rise = np.where(np.abs(rise) < _TINY, _TINY, rise)
-    t = height / rise
-    starts = np.cumsum(counts) - counts
-    enter = np.maximum.reduceat(np.where(rise < 0, t, -np.inf), starts)
-    leave = np.minimum.reduceat(np.where(rise > 0, t, np.inf), starts)
-    return _clip(enter, leave)
-
-
-@dataclass(frozen=True)
-class _Solid:
-    """What the intersection needs to know of one shape.
-
-    Attributes:
-        kind: which function intersects it.
-        scale: (3,) half sizes, m; the map to the unit shape divides by them.
-        radius: of the bounding sphere around `centre`, m.
-        centre: (3,) m, in the shape's frame; also the origin of `faces`.
-        part: (3, 1) of a round box, see `_ball`.
-        ratio: of a capsule, see `_enter_capsule`.
-        faces: (f, 4) of a hull: outward unit normal and distance from the centre, m.
-    """
-
-    kind: int
-    scale: Array
-    radius: float
-    centre: Array = field(default_factory=lambda: np.zeros(3))
-    part: Array = field(default_factory=lambda: _CUBE)
-    ratio: float = 1.0
-    faces: Array = field(default_factory=lambda: np.zeros((0, 4)))
-
-
-def _describe(shape: Shape) -> _Solid | None:
-    """Returns the solid of a shape; None for one without an inside."""
-    if isinstance(shape, Box):
-        half = np.asarray(shape.size()) / 2
-        return _Solid(_ROUND_BOX, half, float(np.linalg.norm(half)))
-    if isinstance(shape, Cylinder):
-        radius, half_length = shape.radius(), shape.length() / 2
-        scale = np.array([radius, radius, half_length])
-        return _Solid(_ROUND_BOX, scale, float(np.hypot(radius, half_length)), part=_TUBE)
-    if isinstance(shape, Ellipsoid):
-        axes = np.array([shape.a(), shape.b(), shape.c()])
-        return _Solid(_ROUND_BOX, axes, float(axes.max()), part=_FULL)
-    if isinstance(shape, Sphere):
-        radius = shape.radius()
-        return _Solid(_ROUND_BOX, np.full(3, radius), radius, part=_FULL) if radius > 0 else None
-    if isinstance(shape, Capsule):
-        radius, half_length = shape.radius(), shape.length() / 2
-        scale = np.full(3, radius)
-        return _Solid(_CAPSULE, scale, radius + half_length, ratio=half_length / radius)
-    if isinstance(shape, HalfSpace):
-        return _Solid(_HULL, np.ones(3), np.inf, faces=np.array([[0.0, 0.0, 1.0, 0.0]]))
-    if isinstance(shape, Convex | Mesh):
-        return _describe_hull(shape)
-    raise ValueError(
-        f"shape is {shape!r}: must be Box, Sphere, Ellipsoid, Cylinder, Capsule, HalfSpace, "
-        "Convex or Mesh"
-    )
-
-
-def _describe_hull(shape: Convex | Mesh) -> _Solid | None:
-    mesh = shape.GetConvexHull()
-    vertices = np.array([mesh.vertex(i) for i in range(mesh.num_vertices())])
-    normals = np.array([mesh.face_normal(i) for i in range(mesh.num_faces())])
-    centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-    radius = float(np.linalg.norm(vertices - centre, axis=1).max())
-    heights = (vertices - centre) @ normals.T
-    if np.ptp(heights, axis=0).min() <= _FLAT * radius:
-        return None
-    faces = np.column_stack([normals, heights.max(axis=0)])
-    return _Solid(_HULL, np.ones(3), radius, centre, faces=faces)
+def _runs(starts: Index, counts: Index) -> tuple[Index, Index]:
+    """Returns the runs [start, start + count) in one row: which run, and the number in it."""
+    run = np.repeat(np.arange(len(counts)), counts)
+    shift = starts - (np.cumsum(counts) - counts)
+    return run, np.arange(len(run)) + shift[run]
 
 
 class Solids:
@@ -202,26 +70,29 @@ class Solids:
 
     def __init__(self, shapes: Sequence[Shape], poses: Sequence[RigidTransform]) -> None:
         require(len(poses) == len(shapes), "poses", len(poses), f"{len(shapes)}, one a shape")
-        described = [(i, _describe(shape)) for i, shape in enumerate(shapes)]
+        described = [(i, describe(shape)) for i, shape in enumerate(shapes)]
         kept = sorted(((i, s) for i, s in described if s is not None), key=lambda e: e[1].kind)
         solids = [solid for _, solid in kept]
-        self._order = np.array([i for i, _ in kept], int)
+        self._order = np.array([i for i, _ in kept], np.intp)
         k = len(kept)
         X = np.array([poses[i].GetAsMatrix34() for i in self._order]).reshape(k, 3, 4)
         centres = np.array([solid.centre for solid in solids]).reshape(k, 3)
-        scales = np.array([solid.scale for solid in solids]).reshape(k, 3)
+        self._scales = np.array([solid.scale for solid in solids]).reshape(k, 3)
+        self._extents = np.array([solid.extent for solid in solids]).reshape(k, 3)
+        self._extents *= 1 + _SLACK
+        self._radii = np.array([solid.radius for solid in solids]) * (1 + _SLACK)
         self._centres = np.einsum("kij,kj->ki", X[:, :, :3], centres) + X[:, :, 3]
         # World to unit shape, without the shift by the centre: (3, 3, k), as gathering is fastest.
-        self._to_unit = np.ascontiguousarray((X[:, :, :3] / scales[:, None, :]).transpose(2, 1, 0))
-        # Rounding must not turn away a ray that only just meets the bounding sphere.
-        self._radii = np.array([solid.radius for solid in solids]) * (1 + 1e-9)
+        self._to_unit = np.ascontiguousarray(
+            (X[:, :, :3] / self._scales[:, None, :]).transpose(2, 1, 0)
+        )
         self._parts = np.array([solid.part[:, 0] for solid in solids]).reshape(k, 3).T.copy()
         self._ratios = np.array([solid.ratio for solid in solids])
         kinds = np.array([solid.kind for solid in solids], int)
-        self._kinds = np.searchsorted(kinds, range(_HULL + 1))
-        hulls = solids[self._kinds[_HULL] :]
+        self._kinds = np.searchsorted(kinds, (ROUND_BOX, CAPSULE, HULL))
+        hulls = solids[self._kinds[-1] :]
         self._faces = np.concatenate([np.zeros((0, 4)), *(hull.faces for hull in hulls)]).T.copy()
-        self._face_counts = np.array([len(hull.faces) for hull in hulls], int)
+        self._face_counts = np.array([len(hull.faces) for hull in hulls], np.intp)
         self._face_starts = np.cumsum(self._face_counts) - self._face_counts
 
     def __len__(self) -> int:
@@ -257,28 +128,40 @@ class Solids:
         Returns:
             (n,) m; inf for a ray that hits nothing within its range.
         """
+        return self.first_hits(origins, directions, max_range)[0]
+
+    def first_hits(
+        self, origins: Array, directions: Array, max_range: float | Array = np.inf
+    ) -> tuple[Array, Index]:
+        """Returns how far each ray gets, as `first_hit` does, and which solid it enters then.
+
+        Returns:
+            (n,) m, and (n,) the solid's number in the constructor's lists; -1 where the distance
+            is inf.
+        """
         distances = np.full(len(directions), np.inf)
-        solid, ray, o, d = self._candidates(np.atleast_2d(origins), directions, max_range)
-        if len(solid) == 0:
-            return distances
-        _, capsules, hulls = np.searchsorted(solid, self._kinds)
-        parts: list[Array] = []
-        with np.errstate(divide="ignore", invalid="ignore"):  # inf and NaN mean something here
-            if capsules > 0:
-                part = self._parts.take(solid[:capsules], axis=1)
-                parts.append(_enter_round_box(o[:, :capsules], d[:, :capsules], part))
-            if hulls > capsules:
-                one = slice(capsules, hulls)
-                parts.append(_enter_capsule(o[:, one], d[:, one], self._ratios[solid[one]]))
-            if len(solid) > hulls:
-                hull = solid[hulls:] - self._kinds[_HULL]
-                faces, counts = self._faces_of(hull)
-                parts.append(_enter_hull(o[:, hulls:], d[:, hulls:], faces, counts))
-        enter = np.concatenate(parts)
-        hit = enter >= 0  # else it starts inside or beyond, or misses
-        np.minimum.at(distances, ray[hit], enter[hit])
+        entered = np.full(len(directions), -1, np.intp)
+        if len(self) == 0 or len(directions) == 0:
+            return distances, entered
+        # About the first origin, which keeps the digits of rays far from the world's origin.
+        origins = np.atleast_2d(origins)
+        base = origins[0]
+        offsets = origins - base if len(origins) > 1 else None
+        c = self._centres - base
+        few = len(self) * len(directions) <= _FEW
+        candidates = self._meet_spheres if few else self._see_azimuths
+        solid, ray = candidates(c, offsets, directions, float(np.max(max_range)))
+        blocks = [slice(i, i + _BLOCK) for i in range(0, len(solid), _BLOCK)] or [slice(0)]
+        enter = np.concatenate(
+            [self._enter(c, offsets, directions, solid[block], ray[block]) for block in blocks]
+        )
+        hit = np.flatnonzero(enter >= 0)  # else it starts inside or beyond, or misses
+        solid, ray, enter = solid[hit], ray[hit], enter[hit]
+        np.minimum.at(distances, ray, enter)
         distances[distances > max_range] = np.inf
-        return distances
+        first = np.flatnonzero(enter == distances[ray])
+        entered[ray[first]] = self._order[solid[first]]
+        return distances, entered
 
     def occluded(
         self, origin: Array, targets: Array, tolerance: float | Array = 0.0
@@ -296,54 +179,107 @@ class Solids:
         """
         rays = targets - origin
         distances = np.sqrt((rays * rays).sum(axis=1))
-        directions = rays / np.maximum(distances, _TINY)[:, None]
+        directions = rays / np.maximum(distances, TINY)[:, None]
         return np.isfinite(self.first_hit(origin, directions, distances - tolerance))
 
-    def _candidates(
-        self, origins: Array, directions: Array, max_range: float | Array
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp], Array, Array]:
-        """Pairs solids and rays that meet the solid's bounding sphere.
-
-        Returns:
-            Index of the solid (ascending) and of the ray, and the ray's origin and direction in
-            the frame of the unit shape, (3, pairs) each.
-        """
-        nothing = np.zeros(0, np.intp)
-        if len(self) == 0 or len(directions) == 0:
-            return nothing, nothing, np.zeros((3, 0)), np.zeros((3, 0))
-        # About the first origin, which keeps the digits of rays far from the world's origin.
-        base = origins[0]
-        o = origins - base
-        c = self._centres - base
+    def _meet_spheres(
+        self, c: Array, offsets: Array | None, directions: Array, reach: float
+    ) -> tuple[Index, Index]:
+        """Pairs each ray with the solids whose bounding sphere it meets; see `_see_azimuths`."""
         r = self._radii[:, None]
         along = c @ directions.T  # how far along the ray its closest point to the centre lies
         square = (c * c).sum(axis=1, keepdims=True)
-        spread = 0.0
-        if len(o) > 1:
-            along -= (o * directions).sum(axis=1)
-            norms = (o * o).sum(axis=1)
-            square = square - 2 * c @ o.T + norms
-            spread = float(np.sqrt(norms.max()))
-        near = along > -r
+        near = np.sqrt(square) - r <= reach
+        if offsets is not None:
+            along -= (offsets * directions).sum(axis=1)
+            norms = (offsets * offsets).sum(axis=1)
+            near = np.sqrt(square) - r <= reach + np.sqrt(norms.max())
+            square = square - 2 * c @ offsets.T + norms
+        near = near & (along > -r)
         along *= along
         near &= along >= square - r * r
-        reach = np.max(max_range) + spread
-        if math.isfinite(reach):
-            near &= np.sqrt((c * c).sum(axis=1, keepdims=True)) - r <= reach
         # Divided by hand: nonzero of two dimensions takes nine times as long.
         solid, ray = np.divmod(np.flatnonzero(near), near.shape[1])
-        to_unit = self._to_unit.take(solid, axis=2)
-        o_unit = -np.einsum("ijk,kj->ik", self._to_unit, c).take(solid, axis=1)
-        if len(o) > 1:
-            o_unit += np.einsum("ijn,jn->in", to_unit, o.T.take(ray, axis=1))
-        d_unit = np.einsum("ijn,jn->in", to_unit, directions.T.take(ray, axis=1))
-        return solid, ray, o_unit, d_unit
+        return solid, ray
 
-    def _faces_of(self, hull: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+    def _see_azimuths(
+        self, c: Array, offsets: Array | None, directions: Array, reach: float
+    ) -> tuple[Index, Index]:
+        """Pairs solids with the rays whose azimuth and height they may be met at.
+
+        Args:
+            c: (k, 3) centres of the solids from the place that the rays are sorted about, m.
+            offsets: (n, 3) where the rays start, from there, m; None for all there.
+            directions: (n, 3).
+            reach: how far the rays go, m.
+
+        Returns:
+            Index of the solid (ascending) and of the ray.
+        """
+        n = len(directions)
+        # A ray that starts beside the place sees a solid where the place sees a larger one.
+        spread = 0.0 if offsets is None else float(np.sqrt((offsets**2).sum(axis=1).max()))
+        half = self._extents + spread
+        along, across, up = c.T
+        with np.errstate(invalid="ignore"):  # NaN, of an endless solid: every ray may meet it
+            axes = self._to_unit * (self._scales * half).T[:, None, :]  # (axis, world, k)
+            x, y = (_CORNERS @ axes[:, w] + c[:, w] for w in (0, 1))
+            # Azimuths of the corners from that of the centre. A solid in whose outline the place
+            # does not lie spans less than half a turn.
+            turn = np.arctan2(along * y - across * x, along * x + across * y)
+            first = turn.min(axis=0)
+            width = turn.max(axis=0) - first
+            beside = (width < np.pi) & (along * along + across * across > 0)
+            height = np.abs(axes[:, 2]).sum(axis=0)
+            distance = np.sqrt((c * c).sum(axis=1))
+            far = np.minimum(distance + self._radii + spread, reach)
+            missed = distance - self._radii > reach + spread
+            missed |= up - height > far * max(directions[:, 2].max(), 0.0)
+            missed |= up + height < far * min(directions[:, 2].min(), 0.0)
+        azimuths = np.arctan2(directions[:, 1], directions[:, 0])
+        order = np.argsort(azimuths, kind="stable")
+        azimuths = azimuths[order]
+        twice = np.concatenate([azimuths, azimuths + 2 * np.pi])
+        start = np.where(beside, np.arctan2(across, along) + first, 0.0) - _SLACK
+        start -= 2 * np.pi * np.floor((start + np.pi) / (2 * np.pi))
+        begin = np.where(beside, twice.searchsorted(start), 0)
+        end = np.where(beside, twice.searchsorted(start + width + 2 * _SLACK), n)
+        solid, place = _runs(begin, np.where(missed, 0, end - begin))
+        return solid, np.concatenate([order, order])[place]
+
+    def _enter(
+        self, c: Array, offsets: Array | None, directions: Array, solid: Index, ray: Index
+    ) -> Array:
+        """Returns where each pair's ray enters the pair's solid; NaN for a miss.
+
+        The solids are in ascending order; for the other arguments see `_see_azimuths`.
+        """
+        to_unit = self._to_unit.take(solid, axis=2)
+        o = -np.einsum("ijk,kj->ik", self._to_unit, c).take(solid, axis=1)
+        if offsets is not None:
+            o += np.einsum("ijn,jn->in", to_unit, offsets.T.take(ray, axis=1))
+        d = np.einsum("ijn,jn->in", to_unit, directions.T.take(ray, axis=1))
+        rounds, capsules, hulls = np.searchsorted(solid, self._kinds)
+        parts: list[Array] = []
+        with np.errstate(divide="ignore", invalid="ignore"):  # inf and NaN mean something here
+            if rounds > 0:
+                parts.append(enter_box(o[:, :rounds], d[:, :rounds]))
+            if capsules > rounds:
+                one = slice(rounds, capsules)
+                part = self._parts.take(solid[one], axis=1)
+                parts.append(enter_round_box(o[:, one], d[:, one], part))
+            if hulls > capsules:
+                one = slice(capsules, hulls)
+                parts.append(enter_capsule(o[:, one], d[:, one], self._ratios[solid[one]]))
+            if len(solid) > hulls:
+                faces, counts = self._faces_of(solid[hulls:] - self._kinds[-1])
+                parts.append(enter_hull(o[:, hulls:], d[:, hulls:], faces, counts))
+        return np.concatenate(parts) if parts else np.zeros(0)
+
+    def _faces_of(self, hull: Index) -> tuple[Array, Index]:
         """Returns the faces of those hulls in one row, (4, ...), and how many each has."""
         counts = self._face_counts[hull]
-        skip = self._face_starts[hull] - (np.cumsum(counts) - counts)
-        row = np.arange(counts.sum()) + np.repeat(skip, counts)
+        _, row = _runs(self._face_starts[hull], counts)
         return self._faces.take(row, axis=1), counts
 
 

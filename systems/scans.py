@@ -34,6 +34,7 @@ def scan_fault(scan: Scan, now: float, max_age: float) -> str | None:
     sound = (
         all(math.isfinite(number) for number in numbers)
         and scan.angle_increment != 0
+        and scan.range_max > scan.range_min  # not NaN either: no point would be left
         and 2 * int(failed.sum()) <= len(scan)
         and not (scan.ranges < 0).any()
     )

@@ -29,6 +29,7 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
+from systems import raycasting
 from systems.raycasting import Solids, SolidsMemo, solids_from_inspector
 
 MISS = np.inf
@@ -60,6 +61,13 @@ L_OBJ = "".join(
     "f 1 2 8 7\nf 2 3 9 8\nf 3 4 10 9\nf 4 5 11 10\nf 5 6 12 11\nf 6 1 7 12\n"
 )
 FLAT_OBJ = "v 0 -1 -1\nv 0 1 -1\nv 0 1 1\nv 0 -1 1\nf 1 2 3\nf 1 3 4\n"
+
+
+@pytest.fixture(params=["by spheres", "by azimuths"], autouse=True)
+def candidates(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All that is said here holds for both ways to find the solids that a ray may meet."""
+    few = 10**9 if request.param == "by spheres" else 0
+    monkeypatch.setattr(raycasting, "_FEW", few)
 
 
 def octahedron() -> Convex:
@@ -324,6 +332,76 @@ def test_all_at_once_equals_one_at_a_time(tmp_path: Path) -> None:
     )
     assert np.isfinite(apart).sum() > 30
     np.testing.assert_allclose(together, apart, atol=1e-9)
+
+
+def fan(n: int) -> np.ndarray:
+    angles = np.linspace(-np.pi, np.pi, n, endpoint=False)
+    return np.column_stack([np.cos(angles), np.sin(angles), np.zeros(n)])
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-4, 0.3, np.pi / 2])
+@pytest.mark.parametrize("spread", [0.0, 0.3])
+def test_a_fan_equals_its_rays_one_at_a_time(
+    tilt: float, spread: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(6)
+    shapes = [*random_shapes(rng, 60, tmp_path), HalfSpace()]
+    poses = [random_pose(rng, 5.0) for _ in shapes[:-1]] + [RigidTransform([0.0, 0.0, -4.0])]
+    directions = fan(200) @ RotationMatrix.MakeYRotation(tilt).matrix().T
+    rng.shuffle(directions)
+    origins = np.array([0.4, -0.2, 0.1]) + spread * rng.uniform(-1, 1, (200, 3))
+    if spread == 0:
+        origins = origins[:1]
+    solids = Solids(shapes, poses)
+    together = solids.first_hit(origins, directions, 9.0)
+    monkeypatch.setattr(raycasting, "_FEW", 10**9)
+    apart = [
+        solids.first_hit(o, d[None], 9.0)[0]
+        for o, d in zip(np.broadcast_to(origins, (200, 3)), directions, strict=True)
+    ]
+    assert np.isfinite(apart).sum() > 50
+    np.testing.assert_allclose(together, apart, atol=1e-9)
+
+
+def test_a_solid_is_seen_across_the_seam_of_the_azimuths() -> None:
+    # Straight behind, where -pi meets pi; around the origin's height; and one around the origin.
+    behind = RigidTransform([-3.0, 0.0, 0.0])
+    distances = Solids([Box(2, 2, 2)], [behind]).first_hit(np.zeros(3), fan(8))
+    np.testing.assert_allclose(distances, [2.0] + [MISS] * 7)
+    # The corners are at 153 degrees either way: 27 degrees to each side of -x.
+    hit = np.isfinite(Solids([Box(2, 2, 2)], [behind]).first_hit(np.zeros(3), fan(360)))
+    assert hit.sum() == 53
+    assert hit[:27].all()
+    assert hit[-26:].all()
+    lid = Solids([Box(2, 2, 2)], [RigidTransform([0.2, 0.1, 3.0])])
+    up = np.array([[0.0, 0.0, 1.0], [0.1, 0.0, 1.0], [-0.5, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    up /= np.linalg.norm(up, axis=1, keepdims=True)
+    np.testing.assert_allclose(
+        lid.first_hit(np.zeros(3), up), [2.0, 2 / up[1, 2], MISS, MISS], atol=1e-12
+    )
+
+
+def test_it_is_said_which_solid_is_hit(tmp_path: Path) -> None:
+    # Numbers go by the constructor's lists, whatever is sorted inside and left out.
+    (tmp_path / "flat.obj").write_text(FLAT_OBJ)
+    shapes = [
+        octahedron(),
+        Mesh(str(tmp_path / "flat.obj")),
+        Sphere(1),
+        Capsule(1, 1),
+        Box(2, 2, 2),
+    ]
+    places = [[5.0, 0, 0], [2.0, 0, 0], [0, 5.0, 0], [-5.0, 0, 0], [0, -5.0, 0]]
+    solids = Solids(shapes, [RigidTransform(np.array(p)) for p in places])
+    directions = np.array([[1.0, 0, 0], [0, 1.0, 0], [-1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]])
+    distances, entered = solids.first_hits(np.zeros(3), directions, 4.5)
+    np.testing.assert_allclose(distances, [4.0, 4.0, 4.0, 4.0, MISS])
+    assert entered.tolist() == [0, 2, 3, 4, -1]
+    _, entered = solids.first_hits(np.zeros(3), directions, 3.9)
+    assert entered.tolist() == [-1] * 5
+    # The nearer of two on one ray.
+    two = Solids([Box(1, 1, 1), Sphere(1)], [RigidTransform([z, 0.0, 0.0]) for z in (6.0, 3.0)])
+    assert two.first_hits(np.zeros(3), directions[:1])[1].tolist() == [1]
 
 
 def test_keeps_its_digits_far_from_the_worlds_origin(tmp_path: Path) -> None:

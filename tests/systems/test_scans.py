@@ -82,6 +82,7 @@ def test_what_is_unfit_for_driving_by() -> None:
     assert scan_fault(good, 4.9, max_age=0.3) == "stale_scan"  # from the future
     assert scan_fault(replace(good, angle_min=math.nan), 5.1, max_age=0.3) == "garbled_scan"
     assert scan_fault(replace(good, angle_increment=0.0), 5.1, max_age=0.3) == "garbled_scan"
+    assert scan_fault(replace(good, range_max=math.nan), 5.1, max_age=0.3) == "garbled_scan"
     negative, failed = np.ones(360), np.ones(360)
     negative[7] = -2.0
     failed[:181] = math.nan
