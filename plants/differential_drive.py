@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.geometry import Box, Cylinder, Sphere
 from pydrake.math import RigidTransform, RotationMatrix, cos, sin
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
@@ -20,10 +21,14 @@ from pydrake.multibody.tree import (
 from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
+from plants.motors import MotorModel
 from systems.validation import require, require_positive
+
+Array = NDArray[np.float64]
 
 _WHEEL_FRICTION = CoulombFriction(1.0, 1.0)
 _NO_FRICTION = CoulombFriction(0.0, 0.0)
+_CREEP = 1e-3  # rad/s, at which a wheel held by its gear's friction gives way
 
 
 @dataclass
@@ -41,8 +46,8 @@ class DifferentialDriveParameters:
         clearance: from the ground to the chassis, m.
         mass: of the chassis with all it carries, kg.
         caster_radius: m.
-        servo_gain: torque by error of wheel speed, N m s/rad.
-        max_torque: of one wheel, N m.
+        servo_gain: torque by error of wheel speed, N m s/rad; of servos, not of motors.
+        max_torque: of one wheel's servo, N m.
     """
 
     wheel_radius: float = 0.0325
@@ -98,21 +103,41 @@ def hull_radius(parameters: DifferentialDriveParameters) -> float:
     return float(max(chassis, wheels))
 
 
+def hull(parameters: DifferentialDriveParameters) -> list[float]:
+    """Returns [front, rear, half_width] (m): the rectangle about base_link that holds the robot.
+
+    To the sides it holds the spheres that the wheels collide as.
+    """
+    end = max(parameters.length / 2, parameters.wheel_radius)
+    return [
+        end,
+        end,
+        parameters.base / 2 + max(parameters.wheel_radius, parameters.wheel_width / 2),
+    ]
+
+
 def add_differential_drive(
-    plant: MultibodyPlant, parameters: DifferentialDriveParameters, name: str
+    plant: MultibodyPlant,
+    parameters: DifferentialDriveParameters,
+    name: str,
+    motor: MotorModel | None = None,
 ) -> ModelInstanceIndex:
     """Adds the robot to a plant.
 
     The body `base_link` has its origin on the ground below the middle of the axle, x forward, y
     left, z up (REP 103, 105). Wheels collide as spheres and casters slide without friction: so the
-    robot follows its kinematics to 0.1 % (cylinders lose up to 0.75 %). The wheels' actuators are
-    speed servos (gain on the velocity only); the instance's `desired_state` port takes
-    [q_right, q_left, w_right, w_left].
+    robot follows its kinematics to 0.1 % (cylinders lose up to 0.75 %).
+
+    The wheels are driven through the instance's `desired_state` port: see `servo_matrix`. Without a
+    motor the actuators are speed servos of `servo_gain` and `max_torque`. With one they make the
+    torque of `plants.motors.DcMotors`, whatever the ground can bear of it: past the friction cone
+    the wheel slips. The rotors' inertia is added, and the gears' friction.
 
     Args:
         plant: not finalized yet.
         parameters: dimensions.
         name: of the model instance.
+        motor: what turns each wheel; None for a speed servo.
 
     Returns:
         The model instance.
@@ -144,8 +169,48 @@ def add_differential_drive(
         )
         plant.RegisterCollisionGeometry(chassis, X_BCaster, caster, f"{end}_caster", _NO_FRICTION)
     for side, y in (("right", -1.0), ("left", 1.0)):
-        _add_wheel(plant, model, chassis, p, side, y)
+        joint = _add_wheel(plant, model, chassis, p, side, y)
+        _add_actuators(plant, joint, p, side, motor)
     return model
+
+
+def servo_matrix(plant: MultibodyPlant, model: ModelInstanceIndex) -> Array:
+    """Returns the matrix from [right, left] (rad/s) to the `desired_state` of the wheels.
+
+    The speeds are set-points of speed servos, or the `servo_speeds` of `DcMotors`. Positions have
+    no gain and the gears' friction holds the wheels back toward speed 0.
+    """
+    actuators = plant.num_actuators(model)
+    drives = [
+        row
+        for row, index in enumerate(plant.GetJointActuatorIndices(model))
+        if plant.get_joint_actuator(index).name() in ("right_motor", "left_motor")
+    ]
+    matrix = np.zeros((2 * actuators, 2))
+    matrix[[actuators + row for row in drives], [0, 1]] = 1.0
+    return matrix
+
+
+def _add_actuators(
+    plant: MultibodyPlant,
+    joint: RevoluteJoint,
+    p: DifferentialDriveParameters,
+    side: str,
+    motor: MotorModel | None,
+) -> None:
+    if motor is None:
+        actuator = plant.AddJointActuator(f"{side}_motor", joint, p.max_torque)
+        actuator.set_controller_gains(PdControllerGains(p=0.0, d=p.servo_gain))
+        return
+    # Drake has no dry friction in joints: a servo toward standstill of no more than that torque is
+    # one, solved implicitly, so that a wheel at rest stays there.
+    friction = plant.AddJointActuator(f"{side}_friction", joint, motor.friction)
+    friction.set_controller_gains(PdControllerGains(p=0.0, d=motor.friction / _CREEP))
+    # After the friction: of two actuators of a joint Drake counts the last one's inertia.
+    actuator = plant.AddJointActuator(f"{side}_motor", joint)
+    actuator.set_controller_gains(PdControllerGains(p=0.0, d=motor.damping))
+    actuator.set_default_rotor_inertia(motor.parameters.rotor_inertia)
+    actuator.set_default_gear_ratio(motor.parameters.gear_ratio)
 
 
 def _add_wheel(
@@ -155,7 +220,7 @@ def _add_wheel(
     p: DifferentialDriveParameters,
     side: str,
     y: float,
-) -> None:
+) -> RevoluteJoint:
     wheel = plant.AddRigidBody(
         f"{side}_wheel",
         model,
@@ -179,8 +244,6 @@ def _add_wheel(
             np.array([0.0, 1.0, 0.0]),
         )
     )
-    actuator = plant.AddJointActuator(f"{side}_motor", joint, p.max_torque)
-    actuator.set_controller_gains(PdControllerGains(p=0.0, d=p.servo_gain))
     plant.RegisterVisualGeometry(
         wheel,
         RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2)),
@@ -198,6 +261,7 @@ def _add_wheel(
     plant.RegisterCollisionGeometry(
         wheel, RigidTransform(), Sphere(p.wheel_radius), "tyre", _WHEEL_FRICTION
     )
+    return joint
 
 
 @TemplateSystem.define("KinematicDifferentialDrive_")

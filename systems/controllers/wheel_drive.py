@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
-from systems.validation import require_positive
+from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,7 @@ class WheelDriveParameters:
         max_turn_rate: rad/s.
         max_acceleration: m/s^2.
         max_turn_acceleration: rad/s^2.
+        rest: until this time no command is taken, s: the robot stands while its gyro is calibrated.
     """
 
     rate: float = 50.0
@@ -33,9 +35,11 @@ class WheelDriveParameters:
     max_turn_rate: float = 3.0
     max_acceleration: float = 1.0
     max_turn_acceleration: float = 10.0
+    rest: float = 0.0
 
     def __post_init__(self) -> None:
-        require_positive(**vars(self))
+        require_positive(**{name: v for name, v in vars(self).items() if name != "rest"})
+        require_non_negative(rest=self.rest)
 
 
 class WheelDrive(LeafSystem):
@@ -54,6 +58,8 @@ class WheelDrive(LeafSystem):
     Args:
         to_wheel_speeds: inverse kinematics, [v, omega] to [right, left] (rad/s).
         parameters: limits and rate.
+        max_wheel_speed: the fastest that a wheel can turn, rad/s. A command that asks for more is
+            scaled down, v and omega alike, so that the robot drives the same curve, slower.
 
     Ports:
         command (input, vector of 2): [v (m/s), omega (rad/s)]. A value that is not finite is
@@ -69,9 +75,13 @@ class WheelDrive(LeafSystem):
         *,
         to_wheel_speeds: Callable[[Array], list[float]],
         parameters: WheelDriveParameters | None = None,
+        max_wheel_speed: float = math.inf,
     ) -> None:
         super().__init__()
+        require(max_wheel_speed > 0, "max_wheel_speed", max_wheel_speed, "greater than 0")
         p = parameters or WheelDriveParameters()
+        self._rest = p.rest
+        self._max_wheel_speed = max_wheel_speed
         self._limit = np.array([p.max_speed, p.max_turn_rate])
         self._change = np.array([p.max_acceleration, p.max_turn_acceleration]) / p.rate
         self._to_wheel_speeds = to_wheel_speeds
@@ -106,11 +116,19 @@ class WheelDrive(LeafSystem):
         if not np.isfinite(command).all():
             self._counts.add(context, discrete_state, bad_command=1)
             command = np.zeros(2)
+        if context.get_time() < self._rest:
+            command = np.zeros(2)
         sent = context.get_discrete_state(self._sent).get_value()
-        wanted = np.clip(command, -self._limit, self._limit)
-        discrete_state.set_value(
-            self._sent, sent + np.clip(wanted - sent, -self._change, self._change)
-        )
+        wanted = self._within_reach(np.clip(command, -self._limit, self._limit))
+        changed = sent + np.clip(wanted - sent, -self._change, self._change)
+        # Once more: on its way from one to the other it may leave what the wheels can do.
+        discrete_state.set_value(self._sent, self._within_reach(changed))
+
+    def _within_reach(self, command: Array) -> Array:
+        if math.isinf(self._max_wheel_speed):
+            return command
+        fastest = float(np.max(np.abs(self._to_wheel_speeds(command))))
+        return command * min(1.0, self._max_wheel_speed / max(fastest, 1e-9))
 
     def _calc_wheel_speeds(self, context: Context, output: Any) -> None:
         output.SetFromVector(

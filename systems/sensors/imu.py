@@ -1,7 +1,8 @@
-"""An inertial sensor: angular rate and specific force, with white noise and a constant bias."""
+"""An inertial sensor: angular rate and specific force, with the errors of real ones."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -18,36 +19,134 @@ Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s^2, as Drake's UniformGravityFieldElement
 
+_PIECE = 2**64  # of the noise stream: no sample has so high a number
+
 
 @dataclass
 class ImuParameters:
-    """Noise of an inertial sensor.
+    """Errors of an inertial sensor. Three numbers are [x, y, z] in the sensor's frame.
+
+    A tolerance is what the maker grants from one piece to the next: the seed draws an error of this
+    piece, uniformly from within, which then stays. The drift is a Gauss-Markov process: it wanders
+    about 0 with the standard deviation `drift` and forgets in `drift_time`.
 
     Attributes:
         gyro_noise_density: rad/s/sqrt(Hz).
-        gyro_bias: constant, [x, y, z] in the sensor's frame, rad/s.
+        gyro_bias: constant, rad/s.
+        gyro_bias_tolerance: rad/s, each axis.
+        gyro_drift: rad/s.
+        gyro_drift_time: s.
+        gyro_scale_tolerance: relative, each axis.
+        gyro_range: the largest rate that is told, rad/s; left out: any.
         accel_noise_density: m/s^2/sqrt(Hz).
-        accel_bias: constant, [x, y, z] in the sensor's frame, m/s^2.
+        accel_bias: constant, m/s^2.
+        accel_bias_tolerance: m/s^2, each axis.
+        accel_drift: m/s^2.
+        accel_drift_time: s.
+        accel_scale_tolerance: relative, each axis.
+        accel_range: m/s^2; left out: any.
+        cross_axis_tolerance: share of each other axis that shows on an axis, of both sensors.
+        bits: of a number that the sensor tells, which has 2^bits steps from -range to +range; 0 for
+            no steps. Needs the ranges.
     """
 
     gyro_noise_density: float = 0.0
     gyro_bias: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    gyro_bias_tolerance: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    gyro_drift: float = 0.0
+    gyro_drift_time: float = 100.0
+    gyro_scale_tolerance: float = 0.0
+    gyro_range: float | None = None
     accel_noise_density: float = 0.0
     accel_bias: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    accel_bias_tolerance: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    accel_drift: float = 0.0
+    accel_drift_time: float = 100.0
+    accel_scale_tolerance: float = 0.0
+    accel_range: float | None = None
+    cross_axis_tolerance: float = 0.0
+    bits: int = 0
 
     def __post_init__(self) -> None:
-        require_non_negative(
-            gyro_noise_density=self.gyro_noise_density,
-            accel_noise_density=self.accel_noise_density,
-        )
-        for name in ("gyro_bias", "accel_bias"):
-            value = getattr(self, name)
-            require(
-                len(value) == 3 and bool(np.isfinite(value).all()),
-                name,
-                value,
-                "three finite numbers",
-            )
+        for kind in ("gyro", "accel"):
+            for name in ("noise_density", "drift", "scale_tolerance"):
+                require_non_negative(**{f"{kind}_{name}": getattr(self, f"{kind}_{name}")})
+            require_positive(**{f"{kind}_drift_time": getattr(self, f"{kind}_drift_time")})
+            for name in (f"{kind}_bias", f"{kind}_bias_tolerance"):
+                value = getattr(self, name)
+                least = 0.0 if name.endswith("tolerance") else -np.inf
+                require(
+                    len(value) == 3 and bool(np.isfinite(value).all()) and min(value) >= least,
+                    name,
+                    value,
+                    "three finite numbers" + (", 0 or greater" if least == 0.0 else ""),
+                )
+            limit = getattr(self, f"{kind}_range")
+            if limit is not None:
+                require_positive(**{f"{kind}_range": limit})
+        require_non_negative(cross_axis_tolerance=self.cross_axis_tolerance)
+        require(0 <= self.bits <= 32, "bits", self.bits, "0 to 32")
+        unlimited = self.gyro_range is None or self.accel_range is None
+        require(not (self.bits and unlimited), "bits", self.bits, "0 unless both ranges are given")
+
+
+@dataclass
+class Mpu6050Parameters(ImuParameters):
+    """The InvenSense MPU-6050 in its finest ranges; every figure can be overridden.
+
+    Source: MPU-6000/MPU-6050 Product Specification, revision 3.4, tables 6.1 and 6.2: gyro +-250
+    deg/s at 131 LSB/(deg/s), rate noise 0.005 deg/s/sqrt(Hz), zero-rate output within +-20 deg/s,
+    sensitivity within 3 %; accelerometer +-2 g at 16384 LSB/g, 400 ug/sqrt(Hz), zero-g output
+    within 50 mg (x, y) and 80 mg (z), calibration within 3 %; cross-axis within 2 %; 16 bits. The
+    sheet gives no drift at rest. Ours stands for the warmth: it grants 20 deg/s from 25 to 85
+    degrees C, so a twentieth of a kelvin is worth 0.017 deg/s, and 60 mg from 0 to 70 degrees C.
+    """
+
+    gyro_noise_density: float = math.radians(0.005)
+    gyro_bias_tolerance: list[float] = field(default_factory=lambda: [math.radians(20.0)] * 3)
+    gyro_drift: float = math.radians(0.017)
+    gyro_scale_tolerance: float = 0.03
+    gyro_range: float | None = math.radians(250.0)
+    accel_noise_density: float = 400e-6 * GRAVITY
+    accel_bias_tolerance: list[float] = field(
+        default_factory=lambda: [0.05 * GRAVITY, 0.05 * GRAVITY, 0.08 * GRAVITY]
+    )
+    accel_drift: float = 50e-6 * GRAVITY
+    accel_scale_tolerance: float = 0.03
+    accel_range: float | None = 2.0 * GRAVITY
+    cross_axis_tolerance: float = 0.02
+    bits: int = 16
+
+
+def piece_errors(parameters: ImuParameters, random: np.random.Generator) -> tuple[Array, Array]:
+    """Draws the errors of one piece.
+
+    Args:
+        parameters: the tolerances.
+        random: of the piece.
+
+    Returns:
+        (6, 6) what multiplies the true [gyro, accel], 1 but for scale errors and cross-axis
+        sensitivity, and (6,) the bias.
+    """
+    p = parameters
+    bias = np.array([*p.gyro_bias, *p.accel_bias])
+    bias += random.uniform(-1, 1, 6) * [*p.gyro_bias_tolerance, *p.accel_bias_tolerance]
+    matrix = np.zeros((6, 6))
+    for k, scale in ((0, p.gyro_scale_tolerance), (3, p.accel_scale_tolerance)):
+        block = random.uniform(-1, 1, (3, 3))
+        block *= np.where(np.eye(3) == 1, scale, p.cross_axis_tolerance)
+        matrix[k : k + 3, k : k + 3] = np.eye(3) + block
+    return matrix, bias
+
+
+def digital(sample: Array, limit: Array, bits: int) -> Array:
+    """Returns samples (..., 6) as a sensor of that range (6,) tells them, in steps of 2^bits."""
+    if not bits:
+        return np.clip(sample, -limit, limit)
+    half = 2.0 ** (bits - 1)
+    step = limit / half
+    return np.clip(np.rint(sample / step), -half, half - 1) * step
 
 
 def ideal_sample(X_WB: RigidTransform, V_WB: Array, A_WB: Array, p_BS: Array) -> Array:
@@ -85,7 +184,7 @@ class Imu(LeafSystem):
         - sample
 
     Args:
-        parameters: noise.
+        parameters: errors.
         rate: samples a second, Hz.
         p_BS: position of the sensor in the body, m.
         seed: of the noise, a parameter of the Context.
@@ -98,7 +197,11 @@ class Imu(LeafSystem):
         sample (output, vector of 6): [gyro (rad/s), accel (m/s^2)] in the body's axes, held between
             samples; zeros before the first.
 
-    White noise of density d sampled at `rate` has the standard deviation d sqrt(rate).
+    White noise of density d sampled at `rate` has the standard deviation d sqrt(rate). The errors
+    of the piece and the first drift are drawn when a simulation is initialized, and are state from
+    then on; without an initialization the piece is perfect but for the given bias. The drift b
+    follows b' = f b + s sqrt(1 - f^2) n, f = exp(-1 / (rate T)), at each sample: stationary with
+    the deviation s and the correlation time T, whatever the rate.
 
     Raises:
         ValueError: rate, seed or position out of range.
@@ -116,10 +219,22 @@ class Imu(LeafSystem):
         super().__init__()
         require_positive(rate=rate)
         p = parameters or ImuParameters()
+        self._parameters = p
         self._rate = rate
-        self._bias = np.array([*p.gyro_bias, *p.accel_bias])
         self._deviation = np.repeat([p.gyro_noise_density, p.accel_noise_density], 3)
         self._deviation *= np.sqrt(rate)
+        self._drift_deviation = np.repeat([p.gyro_drift, p.accel_drift], 3)
+        self._forget = np.exp(-1.0 / (rate * np.repeat([p.gyro_drift_time, p.accel_drift_time], 3)))
+        self._kick = self._drift_deviation * np.sqrt(1.0 - self._forget**2)
+        self._limit = np.repeat(
+            [np.inf if limit is None else limit for limit in (p.gyro_range, p.accel_range)], 3
+        )
+        # What a sensor does not have costs nothing at each of its samples.
+        self._drifts = bool(self._drift_deviation.any())
+        self._distorts = max(p.gyro_scale_tolerance, p.accel_scale_tolerance) > 0 or (
+            p.cross_axis_tolerance > 0
+        )
+        self._limited = bool(np.isfinite(self._limit).any())
         self._p_BS = np.zeros(3) if p_BS is None else np.array(p_BS, float)
         sound = self._p_BS.shape == (3,) and bool(np.isfinite(self._p_BS).all())
         require(sound, "p_BS", self._p_BS.tolist(), "three finite numbers (m)")
@@ -130,6 +245,10 @@ class Imu(LeafSystem):
         self._velocity_input = self.DeclareVectorInputPort("spatial_velocity", 6)
         self._acceleration_input = self.DeclareVectorInputPort("spatial_acceleration", 6)
         self._sample = self.DeclareDiscreteState(6)
+        self._matrix = self.DeclareDiscreteState(np.eye(6).ravel())
+        self._bias = self.DeclareDiscreteState(np.array([*p.gyro_bias, *p.accel_bias]))
+        self._drift = self.DeclareDiscreteState(6)
+        self.DeclareInitializationDiscreteUpdateEvent(self._switch_on)
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._measure)
         self._sample_output = self.DeclareStateOutputPort("sample", self._sample)
 
@@ -149,13 +268,32 @@ class Imu(LeafSystem):
         """Returns the port of the samples."""
         return self._sample_output
 
+    def _switch_on(self, context: Context, discrete_state: DiscreteValues) -> None:
+        random = self._noise.generator(context, _PIECE)
+        matrix, bias = piece_errors(self._parameters, random)
+        discrete_state.set_value(self._matrix, matrix.ravel())
+        discrete_state.set_value(self._bias, bias)
+        drift = self._drift_deviation * random.standard_normal(6)
+        discrete_state.set_value(self._drift, drift)
+
     def _measure(self, context: Context, discrete_state: DiscreteValues) -> None:
-        ideal = ideal_sample(
+        sample = ideal_sample(
             self._pose_input.Eval(context),
             self._velocity_input.Eval(context),
             self._acceleration_input.Eval(context),
             self._p_BS,
         )
+        if self._distorts:
+            sample = context.get_discrete_state(self._matrix).get_value().reshape(6, 6) @ sample
         index = sample_index(context.get_time(), self._rate)
-        noise = self._noise.normals(context, index, 6)
-        discrete_state.set_value(self._sample, ideal + self._bias + self._deviation * noise)
+        noise = self._noise.normals(context, index, 12 if self._drifts else 6)
+        sample = sample + context.get_discrete_state(self._bias).get_value()
+        sample += self._deviation * noise[:6]
+        if self._drifts:
+            drift = context.get_discrete_state(self._drift).get_value()
+            sample += drift
+            drift = self._forget * drift + self._kick * noise[6:]
+            discrete_state.set_value(self._drift, drift)
+        if self._limited:
+            sample = digital(sample, self._limit, self._parameters.bits)
+        discrete_state.set_value(self._sample, sample)

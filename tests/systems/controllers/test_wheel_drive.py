@@ -18,9 +18,11 @@ def to_wheel_speeds(command: np.ndarray) -> list[float]:
 
 
 class Rig:
-    def __init__(self, **parameters: Any) -> None:
+    def __init__(self, max_wheel_speed: float = math.inf, **parameters: Any) -> None:
         self.drive = WheelDrive(
-            to_wheel_speeds=to_wheel_speeds, parameters=WheelDriveParameters(**parameters)
+            to_wheel_speeds=to_wheel_speeds,
+            parameters=WheelDriveParameters(**parameters),
+            max_wheel_speed=max_wheel_speed,
         )
         self.simulator = Simulator(self.drive)
         self.context = self.simulator.get_mutable_context()
@@ -93,7 +95,50 @@ def test_a_command_that_is_not_finite_is_dropped_and_the_drive_slows_down(
     assert rig.bad == 20
 
 
-@pytest.mark.parametrize("field", list(vars(WheelDriveParameters())))
+def test_what_no_wheel_can_do_is_driven_slower_on_the_same_curve() -> None:
+    # The right wheel is to turn at (0.3 + 2.0 * 0.1) / 0.03 = 16.7 rad/s: it can do 60 % of it.
+    limits = {"max_acceleration": 100.0, "max_turn_acceleration": 1000.0}
+    rig = Rig(max_wheel_speed=10.0, **limits)
+    rig.command(0.3, 2.0)
+    np.testing.assert_allclose(rig.to(0.1), [0.18, 1.2])
+    rig.command(-0.3, 2.0)  # here it is the left one
+    np.testing.assert_allclose(rig.to(0.2), [-0.18, 1.2])
+    rig.command(0.1, 0.5)
+    np.testing.assert_allclose(rig.to(0.3), [0.1, 0.5])
+    rig.command(0.0, 0.0)
+    np.testing.assert_array_equal(rig.to(0.4), [0.0, 0.0])
+
+
+def test_on_the_way_from_one_command_to_the_next_no_wheel_is_to_turn_too_fast() -> None:
+    rig = Rig(max_wheel_speed=10.0, max_acceleration=0.2, max_turn_acceleration=30.0)
+    rig.command(0.3, 0.0)
+    rig.to(3.0)
+    rig.command(0.0, 3.0)
+    for k in range(100):
+        speeds = np.abs(to_wheel_speeds(rig.to(3.0 + (k + 0.5) * 0.02)))
+        assert speeds.max() <= 10.0 + 1e-9
+    np.testing.assert_allclose(rig.to(8.0), [0.0, 3.0], atol=1e-9)
+
+
+def test_a_rest_at_the_start_takes_no_command() -> None:
+    rig = Rig(rate=50.0, rest=0.5)
+    rig.command(0.3, 0.5)
+    np.testing.assert_array_equal(rig.to(0.499), [0.0, 0.0])
+    assert rig.to(0.501)[0] > 0
+    rig = Rig(rate=50.0, rest=0.5)
+    rig.command(math.nan, 0.0)
+    rig.to(0.199)
+    assert rig.bad == 10  # it is counted all the same
+
+
+def test_a_rest_or_reach_of_nonsense_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"rest is -1\.0: must be 0 or greater"):
+        WheelDriveParameters(rest=-1.0)
+    with pytest.raises(ValueError, match=r"max_wheel_speed is 0\.0: must be greater than 0"):
+        Rig(max_wheel_speed=0.0)
+
+
+@pytest.mark.parametrize("field", [f for f in vars(WheelDriveParameters()) if f != "rest"])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
 def test_nonsense_is_refused(field: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{field} is {value}: must be greater than 0"):

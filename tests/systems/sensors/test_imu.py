@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -12,7 +13,14 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
 
 from plants.body_state import BodyState
-from systems.sensors.imu import GRAVITY, Imu, ImuParameters, ideal_sample
+from systems.sensors.imu import (
+    GRAVITY,
+    Imu,
+    ImuParameters,
+    Mpu6050Parameters,
+    ideal_sample,
+    piece_errors,
+)
 
 # --- What a perfect sensor measures ---
 
@@ -169,10 +177,207 @@ def test_in_free_fall_it_feels_nothing_but_its_own_spin() -> None:
     np.testing.assert_allclose(edge, [*w, *expected], atol=1e-2)
 
 
+# --- Errors of real ones ---
+
+
+def turning(parameters: ImuParameters, rates: Any, *, seed: int = 0, n: int = 3) -> np.ndarray:
+    """(n, 6) samples of a sensor that turns at constant rates (3,) (rad/s)."""
+    imu = Imu(parameters=parameters, seed=seed)
+    simulator = Simulator(imu)
+    context = simulator.get_mutable_context()
+    imu.pose_input_port().FixValue(context, RigidTransform())
+    imu.spatial_velocity_input_port().FixValue(context, [*rates, 0.0, 0.0, 0.0])
+    imu.spatial_acceleration_input_port().FixValue(context, np.zeros(6))
+    rows = []
+    for k in range(n):
+        simulator.AdvanceTo((k + 0.5) / 100.0)
+        rows.append(imu.sample_output_port().Eval(context).copy())
+    return np.array(rows)
+
+
+def test_the_mpu6050_counts_as_its_sheet_says() -> None:
+    p = Mpu6050Parameters()
+    assert 2**15 / math.degrees(p.gyro_range or 0) == pytest.approx(131, abs=0.1)  # LSB/(deg/s)
+    assert 2**15 / ((p.accel_range or 0) / GRAVITY) == 16384  # LSB/g
+    # 0.05 deg/s rms at a bandwidth of 100 Hz, by the same sheet.
+    assert math.degrees(p.gyro_noise_density) * math.sqrt(100.0) == pytest.approx(0.05)
+    assert p.accel_noise_density == pytest.approx(400e-6 * 9.81)
+    assert [round(math.degrees(b), 6) for b in p.gyro_bias_tolerance] == [20.0] * 3
+    assert [b / GRAVITY for b in p.accel_bias_tolerance] == pytest.approx([0.05, 0.05, 0.08])
+
+
+DIGITAL = ImuParameters(gyro_range=math.radians(250.0), accel_range=2 * GRAVITY, bits=16)
+
+
+def test_it_tells_whole_steps() -> None:
+    step = math.radians(250.0) / 32768
+    found = turning(DIGITAL, [0.4 * step, 0.6 * step, math.radians(1.0)])[-1]
+    np.testing.assert_allclose(found[:3] / step, [0, 1, 131], atol=1e-9)
+    assert found[5] == GRAVITY  # 16384 of them
+    # Noise is rounded too.
+    noisy = dataclasses.replace(DIGITAL, gyro_noise_density=0.01, accel_noise_density=0.1)
+    for row in turning(noisy, np.zeros(3), n=20):
+        counts = row / np.repeat([step, 2 * GRAVITY / 32768], 3)
+        np.testing.assert_allclose(counts, np.rint(counts), atol=1e-6)
+        assert np.abs(counts[:3]).max() > 1
+
+
+def test_it_saturates() -> None:
+    step = math.radians(250.0) / 32768
+    found = turning(DIGITAL, np.radians([251.0, -400.0, 249.0]))[-1]
+    # Two's complement: one step less upward.
+    np.testing.assert_allclose(found[:2] / step, [32767, -32768])
+    assert math.degrees(found[2]) == pytest.approx(249.0, abs=0.01)
+    # Without steps it ends at the range itself; a bias counts against it.
+    smooth = ImuParameters(gyro_range=2.0, gyro_bias=[0.5, 0.0, 0.0])
+    found = turning(smooth, [1.9, 5.0, 1.9])[-1]
+    np.testing.assert_allclose(found, [2.0, 2.0, 1.9, 0.0, 0.0, GRAVITY], atol=1e-12)
+
+
+def test_a_piece_has_errors_of_its_own_within_the_tolerances() -> None:
+    p = Mpu6050Parameters()
+    pieces = [piece_errors(p, np.random.default_rng(seed)) for seed in range(400)]
+    bias = np.array([b for _, b in pieces]) / [*p.gyro_bias_tolerance, *p.accel_bias_tolerance]
+    scale = np.array([np.diag(m) - 1 for m, _ in pieces]) / 0.03
+    for errors in (bias, scale):
+        assert np.abs(errors).max() <= 1.0
+        # Uniform: a third of the square of the tolerance.
+        np.testing.assert_allclose(errors.mean(axis=0), 0.0, atol=5 / np.sqrt(3 * 400))
+        np.testing.assert_allclose((errors**2).mean(axis=0), 1 / 3, atol=0.08)
+        assert np.abs(np.corrcoef(errors.T) - np.eye(6)).max() < 5 / np.sqrt(400)
+    matrices = np.array([m for m, _ in pieces])
+    assert np.abs(matrices[:, :3, 3:]).max() == 0  # an accelerometer is no gyro
+    assert 0.019 < np.abs(matrices[:, :3, :3] - np.eye(3) * matrices[:, :3, :3]).max() <= 0.02
+
+
+def test_scale_and_cross_axis_errors_multiply_what_is_true() -> None:
+    p = ImuParameters(gyro_scale_tolerance=0.03, accel_scale_tolerance=0.1)
+    one, two = (turning(p, [0.0, 0.0, w])[-1] for w in (1.0, 2.0))
+    assert one[2] != 1.0
+    assert abs(one[2] - 1.0) <= 0.03
+    np.testing.assert_allclose(two[:3], 2 * one[:3])
+    assert one[5] == two[5] != GRAVITY
+    np.testing.assert_array_equal(one[[0, 1, 3, 4]], 0.0)
+    crossed = turning(ImuParameters(cross_axis_tolerance=0.02), [0.0, 0.0, 1.0])[-1]
+    assert crossed[2] == 1.0
+    assert 0 < np.abs(crossed[:2]).max() <= 0.02
+
+
+def test_the_errors_of_a_piece_stay_and_the_seed_chooses_the_piece() -> None:
+    p = ImuParameters(
+        gyro_bias=[0.0, 0.0, 1.0],
+        gyro_bias_tolerance=[0.1, 0.0, 0.1],
+        accel_bias_tolerance=[0.0, 0.5, 0.0],
+    )
+    rows = turning(p, np.zeros(3), seed=5, n=5)
+    np.testing.assert_array_equal(rows, np.tile(rows[0], (5, 1)))
+    assert 0 < abs(rows[0, 0]) <= 0.1
+    assert rows[0, 1] == 0
+    assert 0 < abs(rows[0, 2] - 1.0) <= 0.1
+    assert 0 < abs(rows[0, 4]) <= 0.5
+    np.testing.assert_array_equal(turning(p, np.zeros(3), seed=5), rows[:3])
+    assert (turning(p, np.zeros(3), seed=6)[0] != rows[0]).sum() == 3
+
+
+def test_the_seed_in_the_context_is_the_one_that_counts() -> None:
+    imu = Imu(parameters=Mpu6050Parameters(), seed=5)
+    simulator = Simulator(imu)
+    context = simulator.get_mutable_context()
+    imu.pose_input_port().FixValue(context, RigidTransform())
+    for port in (imu.spatial_velocity_input_port(), imu.spatial_acceleration_input_port()):
+        port.FixValue(context, np.zeros(6))
+    context.get_mutable_numeric_parameter(0).SetFromVector([6.0])
+    simulator.AdvanceTo(0.005)
+    found = imu.sample_output_port().Eval(context)
+    np.testing.assert_array_equal(found, turning(Mpu6050Parameters(), np.zeros(3), seed=6)[0])
+
+
+def allan_variance(rows: np.ndarray, cluster: int) -> np.ndarray:
+    """Overlapping Allan variance of each column, of means over `cluster` samples (IEEE 952)."""
+    total = np.vstack([np.zeros(rows.shape[1]), rows.cumsum(axis=0)])
+    means = (total[cluster:] - total[:-cluster]) / cluster
+    return ((means[cluster:] - means[:-cluster]) ** 2).mean(axis=0) / 2
+
+
+def test_the_allan_deviation_shows_noise_and_drift() -> None:
+    rate, T = 20.0, 2.0
+    p = ImuParameters(
+        gyro_noise_density=0.002,
+        gyro_drift=0.004,
+        gyro_drift_time=T,
+        accel_noise_density=0.03,
+        accel_drift=0.05,
+        accel_drift_time=T,
+    )
+    rows = samples(30_000, parameters=p, rate=rate)
+    noise, drift = np.repeat([0.002, 0.03], 3), np.repeat([0.004, 0.05], 3)
+    np.testing.assert_allclose(rows.mean(axis=0)[:5], 0.0, atol=0.01)
+    for cluster in (1, 4, 20, 40, 80, 200):
+        tau = cluster / rate
+        # IEEE 952, C.1.1.7: exponentially correlated noise; and white noise N^2 / tau.
+        x = tau / T
+        correlated = 2 * drift**2 / x * (1 - (3 - 4 * np.exp(-x) + np.exp(-2 * x)) / (2 * x))
+        expected = noise**2 / tau + correlated
+        found = allan_variance(rows, cluster)
+        # Each column is a series of its own. n clusters tell a variance to sqrt(2 / n) of it.
+        spread = 4 * np.sqrt(2 * cluster / len(rows))
+        np.testing.assert_allclose(found, expected, rtol=spread)
+        for kind in (slice(0, 3), slice(3, 6)):
+            ratio = (found[kind] / expected[kind]).mean()
+            assert ratio == pytest.approx(1.0, abs=spread / np.sqrt(3)), tau
+    # Neither alone would do.
+    tau = 40 / rate
+    assert (allan_variance(rows, 40) > 2 * noise**2 / tau).all()
+    assert (allan_variance(rows, 1) > 5 * 2 / 3 * drift**2 / (T * rate)).all()
+
+
+@pytest.mark.parametrize("rate", [5.0, 50.0])
+def test_the_drift_wanders_alike_at_any_rate(rate: float) -> None:
+    p = ImuParameters(gyro_drift=0.1, gyro_drift_time=0.5, accel_drift=0.1, accel_drift_time=0.5)
+    # Stationary from the first sample on: over 300 seeds, then along one run.
+    first = np.array([samples(1, parameters=p, rate=rate, seed=s)[0] for s in range(150)])
+    first[:, 5] -= GRAVITY
+    assert (first**2).mean() == pytest.approx(0.01, rel=5 * np.sqrt(2 / 900))
+    rows = samples(int(400 * rate), parameters=p, rate=rate)
+    rows[:, 5] -= GRAVITY
+    assert (rows**2).mean() == pytest.approx(0.01, rel=0.15)
+    lag = round(0.4 * rate)
+    found = (rows[lag:] * rows[:-lag]).mean() / (rows**2).mean()
+    assert found == pytest.approx(math.exp(-0.8), abs=0.08)
+
+
+def test_it_does_not_matter_how_often_it_is_looked_at() -> None:
+    p = Mpu6050Parameters()
+    once = samples(30, parameters=p, seed=2)
+    imu = Imu(parameters=p, seed=2)
+    simulator = Simulator(imu)
+    context = simulator.get_mutable_context()
+    imu.pose_input_port().FixValue(context, RigidTransform())
+    for port in (imu.spatial_velocity_input_port(), imu.spatial_acceleration_input_port()):
+        port.FixValue(context, np.zeros(6))
+    simulator.AdvanceTo(0.103)
+    saved = context.Clone()
+    for _ in range(2):  # once, and once more from the same moment
+        simulator.get_mutable_context().SetTimeStateAndParametersFrom(saved)
+        simulator.reset_context(simulator.get_mutable_context().Clone())
+        simulator.AdvanceTo(0.295)
+        found = imu.sample_output_port().Eval(simulator.get_context())
+        np.testing.assert_array_equal(found, once[29])
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
         ("gyro_noise_density", -1.0),
+        ("gyro_drift", -1.0),
+        ("accel_drift_time", 0.0),
+        ("accel_scale_tolerance", math.inf),
+        ("gyro_range", 0.0),
+        ("accel_bias_tolerance", [0.1, -0.1, 0.1]),
+        ("gyro_bias_tolerance", [0.1]),
+        ("cross_axis_tolerance", -0.1),
+        ("bits", 33),
+        ("bits", 16),  # of what range?
         ("accel_noise_density", math.nan),
         ("gyro_bias", [0.0, 0.0]),
         ("accel_bias", [0.0, math.inf, 0.0]),
