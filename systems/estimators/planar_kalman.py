@@ -151,6 +151,7 @@ class PlanarKalmanFilter(LeafSystem):
         - pose
         - covariance
         - health
+        - nis
 
     Args:
         parameters: noise and options.
@@ -170,6 +171,9 @@ class PlanarKalmanFilter(LeafSystem):
             the first marker pose.
         health (output, Health): marker poses accepted, refused by the gate, refused as ambiguous,
             not finite or without variances; IMU samples and commands not finite.
+        nis (output, vector of 2): of the last marker pose that was compared with the estimate, the
+            squared Mahalanobis distance by degrees of freedom (1 on average if all is right),
+            refused ones included; and how many there were. [NaN, 0] before the first.
 
     Source: [NAV] 4.2. We differ in that marker poses carry their own covariance (unless
     `measurement_noise` is given), in the offset (`rebase`), and in the start at the first marker.
@@ -195,6 +199,8 @@ class PlanarKalmanFilter(LeafSystem):
         self._pose_output = self.DeclareStateOutputPort("pose", self._x)
         self._covariance_output = self.DeclareStateOutputPort("covariance", self._P)
         self._counts = Counts(self, *REASONS)
+        self._nis = self.DeclareDiscreteState([np.nan, 0.0])
+        self._nis_output = self.DeclareStateOutputPort("nis", self._nis)
 
     def command_input_port(self) -> InputPort:
         """Returns the port of the command as sent to the wheels."""
@@ -224,6 +230,10 @@ class PlanarKalmanFilter(LeafSystem):
         """Returns the port of the counts."""
         return self._counts.output_port
 
+    def nis_output_port(self) -> OutputPort:
+        """Returns the port of the last innovation and the number of them."""
+        return self._nis_output
+
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         x = context.get_discrete_state(self._x).get_value()
         P = context.get_discrete_state(self._P).get_value().reshape(3, 3)
@@ -234,8 +244,11 @@ class PlanarKalmanFilter(LeafSystem):
         if marker_pose.valid and marker_pose.stamp != last_stamp:
             last_stamp = marker_pose.stamp
             alternative = self._alternative_input.Eval(context)
-            verdict, x, P = self._correct(x, P, marker_pose, alternative)
+            verdict, x, P, distance = self._correct(x, P, marker_pose, alternative)
             counts[verdict] += 1
+            if not math.isnan(distance):
+                number = context.get_discrete_state(self._nis)[1]
+                discrete_state.set_value(self._nis, [distance / 3, number + 1])
             if verdict == "accepted" and self._parameters.rebase:
                 offset = wrap(float(x[2] - theta_imu))
         yaw_rate = self._imu_input.Eval(context)[2]
@@ -256,26 +269,26 @@ class PlanarKalmanFilter(LeafSystem):
 
     def _correct(
         self, x: Array, P: Array, marker_pose: PoseEstimate, alternative: PoseEstimate
-    ) -> tuple[str, Array, Array]:
-        """Returns what became of a marker pose, and the state and covariance after it."""
+    ) -> tuple[str, Array, Array, float]:
+        """Returns what became of a marker pose, state and covariance after it, and its distance."""
         choices = [marker_pose]
         if marker_pose.ambiguous:
             if self._parameters.ambiguous == "reject":
-                return "ambiguous", x, P
+                return "ambiguous", x, P, math.nan
             if alternative.valid and alternative.stamp == marker_pose.stamp:
                 choices.append(alternative)
         measured = [self._measurement(choice) for choice in choices]
         if not all(_sound(z, R) for z, R in measured):
-            return "bad_marker_pose", x, P
+            return "bad_marker_pose", x, P, math.nan
         if P[0, 0] >= UNKNOWN:  # the first one: there is no prediction to choose by
             if marker_pose.ambiguous:
-                return "ambiguous", x, P
-            return "accepted", *measured[0]
+                return "ambiguous", x, P, math.nan
+            return "accepted", *measured[0], math.nan
         distances = [mahalanobis(x, P, z, R) for z, R in measured]
         nearest = int(np.argmin(distances))
         if distances[nearest] > self._parameters.gate:
-            return "gated", x, P
-        return "accepted", *update(x, P, *measured[nearest])
+            return "gated", x, P, distances[nearest]
+        return "accepted", *update(x, P, *measured[nearest]), distances[nearest]
 
     def _measurement(self, estimate: PoseEstimate) -> tuple[Array, Array]:
         noise = self._parameters.measurement_noise

@@ -385,6 +385,28 @@ def test_an_innovation_beyond_the_gate_is_refused() -> None:
         assert rig.counts == expected
 
 
+def test_the_innovation_is_reported_accepted_or_not() -> None:
+    rig = Rig(speed_noise=1e-9, heading_noise=1e-9)
+
+    def nis() -> list[float]:
+        return rig.block.nis_output_port().Eval(rig.context).tolist()
+
+    rig.step(5)
+    assert math.isnan(nis()[0])
+    assert nis()[1] == 0
+    rig.marker(marker([0.0, 0.0, 0.0], stamp=0.1))
+    rig.step(5)
+    assert nis()[1] == 0  # there was nothing to compare the first with
+    for k, (x, squared) in enumerate(((0.04, 0.04**2 / 8e-4), (0.52, 0.50**2 / 6e-4))):
+        rig.marker(marker([x, 0.0, 0.0], stamp=0.2 + k))
+        rig.step(5)
+        assert nis() == [pytest.approx(squared / 3, rel=1e-6), k + 1]
+    rig.marker(marker([0.0, 0.0, 0.0], stamp=9.0, deviation=(0.0, 0.0, 0.0)))
+    rig.step(5)
+    assert nis()[1] == 2
+    assert rig.counts == {"accepted": 2, "gated": 1, "bad_marker_pose": 1}
+
+
 def test_of_two_solutions_the_one_nearest_to_the_prediction_is_taken() -> None:
     right, wrong = [0.01, 0.0, 0.02], [0.30, 0.2, 0.60]
     for pair in ((right, wrong), (wrong, right)):

@@ -1,0 +1,283 @@
+"""Motion and measurement model of a robot that knows its commands, its gyro and marker poses.
+
+State: x (m), y (m), theta (rad) of base_link in map, the bias of the gyro (rad/s), the scale of the
+wheels (true speed by commanded speed), and the scale of the gyro (true turn by measured turn). Bias
+and scales are states, not noise, because they last: an error of 0.02 rad/s or 3 % is the same now
+as in the last second, so markers tell what it is and dead reckoning goes on with it. White noise in
+their place, as in [NAV], would have to be so large that the covariance says nothing.
+
+Covariances are in the order of the state. All functions are pure; times in seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.angles import wrap
+from systems.estimators.planar_kalman import UNKNOWN, mahalanobis
+
+Array = NDArray[np.float64]
+
+SIZE = 6
+THETA, BIAS, SCALE, GYRO_SCALE = 2, 3, 4, 5
+
+_IDENTITY = np.eye(SIZE)
+_NO_POSITION_NOISE = np.diag([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
+
+
+class Drive(NamedTuple):
+    """What moves the robot during one step.
+
+    Attributes:
+        speed: as commanded (or measured by encoders), m/s.
+        yaw_rate: as the gyro says, rad/s.
+        speed_variance: of the distance, m^2/s, beyond the model's own.
+        turn_variance: of the heading, rad^2/s, beyond the model's own.
+        gyro_weight: how many times the gyro's own noise counts; more than once where one sample
+            stands for several.
+    """
+
+    speed: float
+    yaw_rate: float
+    speed_variance: float = 0.0
+    turn_variance: float = 0.0
+    gyro_weight: float = 1.0
+
+
+class ProcessNoise(NamedTuple):
+    """Variances that grow with time, distance or turning: squares of the filter's parameters.
+
+    Attributes:
+        speed: of the distance, by time, m^2/s.
+        slip: of the distance, by distance, m^2/m.
+        side: of the sideways position, by turning, m^2/rad.
+        gyro: of the heading, by time, rad^2/s.
+        turn: of the heading, by turning, rad^2/rad.
+        bias: of the gyro's bias, by time, (rad/s)^2/s.
+        scale: of the wheels' scale, by time, 1/s.
+        gyro_scale: of the gyro's scale, by time, 1/s.
+    """
+
+    speed: float
+    slip: float
+    side: float
+    gyro: float
+    turn: float
+    bias: float
+    scale: float
+    gyro_scale: float
+
+
+def unknown(bias_std: float, scale_std: float, gyro_scale_std: float) -> tuple[Array, Array]:
+    """Returns state (6,) and covariance (6, 6) before anything is known of the pose.
+
+    Args:
+        bias_std: standard deviation of the gyro's bias, rad/s.
+        scale_std: of the wheels' scale.
+        gyro_scale_std: of the gyro's scale.
+    """
+    x = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
+    known = np.square([bias_std, scale_std, gyro_scale_std])
+    return x, np.diag([UNKNOWN, UNKNOWN, UNKNOWN, *known])
+
+
+def is_known(P: Array) -> bool:
+    """Whether there has been a start: whether the covariance is not that of `unknown`."""
+    return bool(P[0, 0] < UNKNOWN)
+
+
+def predict(
+    x: Array, P: Array, drive: Drive, dt: float, noise: ProcessNoise
+) -> tuple[Array, Array]:
+    """Dead-reckons one step with the heading of its middle, which follows an arc to second order.
+
+    Args:
+        x: (6,) state.
+        P: (6, 6) its covariance.
+        drive: speed and yaw rate, constant over the step.
+        dt: length of the step, s.
+        noise: variance rates.
+
+    Returns:
+        The state and F P F' + G Q G' after the step.
+    """
+    F, G, predicted = linearize(x, drive, dt)
+    v, omega = abs(drive.speed), abs(drive.yaw_rate)
+    Q = np.array(
+        (
+            (noise.speed + noise.slip * v + drive.speed_variance) * dt,
+            noise.side * omega * dt,
+            ((noise.gyro + noise.turn * omega) * drive.gyro_weight + drive.turn_variance) * dt,
+            noise.bias * dt,
+            noise.scale * dt,
+            noise.gyro_scale * dt,
+        )
+    )
+    return predicted, F @ P @ F.T + G * Q @ G.T
+
+
+def linearize(x: Array, drive: Drive, dt: float) -> tuple[Array, Array, Array]:
+    """Returns the derivatives of one step and where it leads.
+
+    Returns:
+        F: (6, 6) by the state. G: (6, 6) by what noise adds over the step: distance along and
+        across the heading (m), heading (rad), bias (rad/s), scales. The state after it: (6,).
+    """
+    px, py, theta, bias, scale, gyro_scale = x.tolist()
+    measured = (drive.yaw_rate - bias) * dt
+    turn = gyro_scale * measured
+    c, s = math.cos(theta + turn / 2), math.sin(theta + turn / 2)
+    by_scale_x, by_scale_y = drive.speed * dt * c, drive.speed * dt * s
+    dx, dy = scale * by_scale_x, scale * by_scale_y
+    F = _IDENTITY.copy()
+    F[0, 2], F[1, 2] = -dy, dx
+    # A change of the turn moves the heading, and half of it that of the middle.
+    F[2, 3], F[2, 5] = -gyro_scale * dt, measured
+    F[0, 3], F[1, 3] = dy * gyro_scale * dt / 2, -dx * gyro_scale * dt / 2
+    F[0, 4], F[1, 4] = by_scale_x, by_scale_y
+    F[0, 5], F[1, 5] = -dy * measured / 2, dx * measured / 2
+    G = _NO_POSITION_NOISE.copy()
+    G[0, 0], G[1, 0] = c, s
+    G[0, 1], G[1, 1] = -s, c
+    # Turning noise comes evenly over the step: the middle has half of it.
+    G[0, 2], G[1, 2] = -dy / 2, dx / 2
+    return F, G, np.array((px + dx, py + dy, wrap(theta + turn), bias, scale, gyro_scale))
+
+
+def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
+    """Corrects the state by a measured pose; the covariance in Joseph's form.
+
+    Joseph's form, (I - K H) P (I - K H)' + K R K', stays symmetric and positive whatever rounding
+    does to K: marker poses can be a thousand times as exact as the prediction.
+
+    Args:
+        x: (6,) state.
+        P: (6, 6).
+        z: (3,) measured [x, y, theta].
+        R: (3, 3) its covariance.
+
+    Returns:
+        The corrected state and covariance.
+    """
+    y = z - x[:3]
+    y[2] = wrap(float(y[2]))
+    K = np.linalg.solve(P[:3, :3] + R, P[:3]).T
+    A = _IDENTITY.copy()
+    A[:, :3] -= K
+    corrected = x + K @ y
+    corrected[THETA] = wrap(float(corrected[THETA]))
+    P = A @ P @ A.T + K @ R @ K.T
+    return corrected, (P + P.T) / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """What one picture says of the pose.
+
+    Attributes:
+        stamp: time of the picture, s.
+        poses: (1 or 2, 3) [x, y, theta], the better solution first.
+        covariances: (1 or 2, 3, 3) of them.
+        ambiguous: whether the second is nearly as good as the first.
+    """
+
+    stamp: float
+    poses: Array
+    covariances: Array
+    ambiguous: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What became of a measurement.
+
+    Attributes:
+        verdict: `started`, `accepted`, `gated` or `ambiguous` (refused for that).
+        x: (6,) state after it.
+        P: (6, 6) covariance after it.
+        nis: squared Mahalanobis distance by degrees of freedom; NaN if none was looked at.
+        x_before: (6,) state before it, at the time of the picture.
+        P_before: (6, 6).
+    """
+
+    verdict: str
+    x: Array
+    P: Array
+    nis: float
+    x_before: Array
+    P_before: Array
+
+
+def correct(
+    x: Array,
+    P: Array,
+    measurement: Measurement,
+    drive: Drive,
+    *,
+    stamp_variance: float,
+    gate: float,
+    take_ambiguous: bool,
+) -> Correction:
+    """Starts from a measurement, takes it, or refuses it.
+
+    Args:
+        x: (6,) state at the time of the picture.
+        P: (6, 6).
+        measurement: with its second solution, if there is one.
+        drive: how the robot moved then.
+        stamp_variance: of the time of the picture, s^2.
+        gate: largest squared Mahalanobis distance that is taken.
+        take_ambiguous: whether the nearer solution of an ambiguous picture is taken. A start needs
+            one that is not ambiguous.
+    """
+    known = is_known(P)
+    if measurement.ambiguous and not (known and take_ambiguous):
+        return Correction("ambiguous", x, P, math.nan, x, P)
+    poses = measurement.poses
+    v, theta = float(x[SCALE]) * drive.speed, float(x[THETA] if known else poses[0, THETA])
+    omega = float(x[GYRO_SCALE] * (drive.yaw_rate - x[BIAS]))
+    velocity = np.array([v * math.cos(theta), v * math.sin(theta), omega])
+    # Taken a moment earlier or later, it would show a pose further back or ahead.
+    covariances = measurement.covariances + stamp_variance * np.outer(velocity, velocity)
+    if not known:
+        start, P_start = x.copy(), P.copy()
+        start[:3], P_start[:3, :3] = poses[0], covariances[0]
+        return Correction("started", start, P_start, math.nan, x, P)
+    choices = len(poses) if measurement.ambiguous else 1
+    distances = [mahalanobis(x[:3], P[:3, :3], poses[i], covariances[i]) for i in range(choices)]
+    nearest = int(np.argmin(distances))
+    nis = distances[nearest] / 3
+    if distances[nearest] > gate:
+        return Correction("gated", x, P, nis, x, P)
+    return Correction("accepted", *update(x, P, poses[nearest], covariances[nearest]), nis, x, P)
+
+
+def is_covariance(R: Array) -> bool:
+    """Whether R (3, 3) is finite, positive definite and says something at all.
+
+    Zeros are what many send who have no covariance.
+    """
+    if not np.isfinite(R).all():
+        return False
+    (a, b, c), (_, d, e), (_, _, f) = R.tolist()
+    minor = a * d - b * b
+    determinant = minor * f - a * e * e + 2 * b * c * e - d * c * c
+    return min(a, d, f, minor, determinant) > 0 and max(a, d, f) < UNKNOWN
+
+
+def chi_square_3(probability: float) -> float:
+    """Returns what a chi-square with 3 degrees of freedom stays below with this probability.
+
+    Its distribution is erf(sqrt(q / 2)) - sqrt(2 q / pi) exp(-q / 2); solved by bisection.
+    """
+    low, high = 0.0, 1e3
+    for _ in range(100):
+        q = (low + high) / 2
+        below = math.erf(math.sqrt(q / 2)) - math.sqrt(2 * q / math.pi) * math.exp(-q / 2)
+        low, high = (q, high) if below < probability else (low, q)
+    return low
