@@ -1,0 +1,1 @@
+"""Avoiders: around what the lidar sees, toward the goal. All have the same ports."""

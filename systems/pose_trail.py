@@ -1,0 +1,58 @@
+"""A short trail of poses: where the robot was when each ray of a scan was measured."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.messages import Scan
+
+Array = NDArray[np.float64]
+
+
+def empty_trail(*, duration: float, rate: float) -> Array:
+    """Returns a trail without a pose: (n, 4) rows [t (s), x (m), y (m), theta (rad)], all NaN.
+
+    Args:
+        duration: how far it is to reach back, s.
+        rate: how often a pose is added, Hz.
+    """
+    return np.full((math.ceil(duration * rate) + 2, 4), np.nan)
+
+
+def remember(trail: Array, t: float, pose: Array) -> Array:
+    """Returns the trail with a pose (3,) added at its end and the oldest one dropped."""
+    return np.vstack([trail[1:], [t, *pose]])
+
+
+def poses_at(trail: Array, times: Array) -> Array:
+    """Returns the poses at times (n,) s: (n, 3), interpolated; theta is not wrapped.
+
+    Before the oldest pose the robot is taken to have stood there; after the newest, to stand there
+    still. NaN when the trail has no pose.
+    """
+    known = trail[np.isfinite(trail).all(axis=1)]
+    if len(known) == 0:
+        return np.full((len(times), 3), np.nan)
+    columns = (known[:, 1], known[:, 2], np.unwrap(known[:, 3]))
+    return np.stack([np.interp(times, known[:, 0], column) for column in columns], axis=-1)
+
+
+def ray_poses(scan: Scan, lidar_pose: Array, trail: Array) -> Array:
+    """Returns where each ray of a scan began and where it went, in the trail's frame.
+
+    Args:
+        scan: n rays.
+        lidar_pose: (3,) [x (m), y (m), yaw (rad)] of the lidar in the body.
+        trail: of the body.
+
+    Returns:
+        (n, 3) [x (m), y (m), direction (rad)].
+    """
+    body = poses_at(trail, scan.stamp + scan.time_increment * np.arange(len(scan), dtype=float))
+    c, s = np.cos(body[:, 2]), np.sin(body[:, 2])
+    x = body[:, 0] + c * lidar_pose[0] - s * lidar_pose[1]
+    y = body[:, 1] + s * lidar_pose[0] + c * lidar_pose[1]
+    return np.stack([x, y, body[:, 2] + lidar_pose[2] + scan.angles], axis=-1)
