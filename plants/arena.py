@@ -1,71 +1,34 @@
-"""Arenas: the ground, walls and marker boards around a robot, from plain numbers."""
+"""Arenas: the ground, obstacles and marker boards around a robot, from plain numbers."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Box
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 
 from plants.boards import add_board
+from plants.moving import MovingCylinder, add_moving_cylinders
+from plants.obstacles import BoxObstacle, CylinderObstacle, Wall
+from plants.planar_shapes import PlanarShapes
 from systems.markers.layout import Marker, MarkerMap
-from systems.validation import require, require_positive
+from systems.validation import require_positive
 
 Array = NDArray[np.float64]
+StandingObstacle = Wall | BoxObstacle | CylinderObstacle
 
 _FRICTION = CoulombFriction(1.0, 1.0)
-_WALL_COLOUR = np.array([0.62, 0.62, 0.58, 1.0])
+_COLOURS = {
+    Wall: np.array([0.62, 0.62, 0.58, 1.0]),
+    BoxObstacle: np.array([0.55, 0.47, 0.36, 1.0]),
+    CylinderObstacle: np.array([0.36, 0.50, 0.47, 1.0]),
+}
 _GROUND_COLOUR = np.array([0.42, 0.42, 0.40, 1.0])
 MARKER_CLEARANCE = 0.001  # m; a marker's face nearer to a wall than this flickers in pictures
-
-
-@dataclass
-class Wall:
-    """An upright wall on the ground.
-
-    Attributes:
-        start: [x, y] of one end of its centre line, m.
-        end: [x, y] of the other end, m.
-        thickness: m.
-        height: m.
-    """
-
-    start: list[float]
-    end: list[float]
-    thickness: float = 0.05
-    height: float = 0.6
-
-    def __post_init__(self) -> None:
-        for name in ("start", "end"):
-            value = getattr(self, name)
-            require(
-                len(value) == 2 and bool(np.isfinite(value).all()), name, value, "[x, y] in metres"
-            )
-        require(self.start != self.end, "end", self.end, "another point than start")
-        require_positive(thickness=self.thickness, height=self.height)
-
-    @property
-    def length(self) -> float:
-        """Length of the centre line, m."""
-        return float(np.hypot(*np.subtract(self.end, self.start)))
-
-    def pose(self) -> RigidTransform:
-        """Returns the pose of the wall's box: origin at its centre, x along the wall."""
-        along = np.subtract(self.end, self.start)
-        x, y = np.add(self.start, self.end) / 2
-        return RigidTransform(
-            RollPitchYaw(0.0, 0.0, float(np.arctan2(along[1], along[0]))), [x, y, self.height / 2]
-        )
-
-    def distance(self, points: Array) -> Array:
-        """Returns the distance of points (n, 3) from the wall's surface, m; negative inside."""
-        local = np.abs(self.pose().inverse().multiply(np.atleast_2d(points).T).T)
-        outside = local - np.array([self.length, self.thickness, self.height]) / 2
-        return np.linalg.norm(np.maximum(outside, 0), axis=1) + np.minimum(outside.max(axis=1), 0)
 
 
 @dataclass
@@ -74,67 +37,90 @@ class ArenaParameters:
 
     Attributes:
         walls: the walls.
+        boxes: boxes that stand still.
+        cylinders: cylinders that stand still.
+        moving: cylinders that travel back and forth.
         ground: side of the visible square of ground about the origin, m; contact goes on for 100 m.
     """
 
     walls: list[Wall] = field(default_factory=list)
+    boxes: list[BoxObstacle] = field(default_factory=list)
+    cylinders: list[CylinderObstacle] = field(default_factory=list)
+    moving: list[MovingCylinder] = field(default_factory=list)
     ground: float = 12.0
 
     def __post_init__(self) -> None:
         require_positive(ground=self.ground)
+        standing = list(self.standing())
+        for index, cylinder in enumerate(self.moving):
+            swept = cylinder.swept()
+            for name, obstacle in standing:
+                gap = float(swept.distances(obstacle.footprint()).min())
+                if gap < 0:
+                    raise ValueError(
+                        f"moving[{index}]: its path leads through {name}: {-gap:.3f} m too near"
+                    )
+
+    def standing(self) -> Iterator[tuple[str, StandingObstacle]]:
+        """Yields what stands still, by name: `walls[0]`, ..., `boxes[0]`, ..., `cylinders[0]`."""
+        for kind in ("walls", "boxes", "cylinders"):
+            for index, obstacle in enumerate(getattr(self, kind)):
+                yield f"{kind}[{index}]", obstacle
+
+    def footprints(self) -> PlanarShapes:
+        """Returns the ground that is covered by what stands still, in the order of `standing`."""
+        return PlanarShapes.joined(obstacle.footprint() for _, obstacle in self.standing())
 
 
 def check_markers(arena: ArenaParameters, markers: MarkerMap) -> None:
-    """Raises `ValueError` for a marker that lies inside a wall or on its very surface."""
+    """Raises `ValueError` for a marker that lies inside an obstacle or on its very surface."""
     for marker in markers:
-        for index, wall in enumerate(arena.walls):
-            gap = _gap(wall, marker)
+        for name, obstacle in arena.standing():
+            gap = obstacle.gap(marker)
             if gap < MARKER_CLEARANCE:
                 raise ValueError(
-                    f"marker {marker.id} is {gap:.4f} m from walls[{index}]: must be at least "
+                    f"marker {marker.id} is {gap:.4f} m from {name}: must be at least "
                     f"{MARKER_CLEARANCE} m in front of it"
                 )
 
 
-def _gap(wall: Wall, marker: Marker) -> float:
-    """Returns how far a marker's square is from a wall's box, m; negative when they overlap.
-
-    That is along the axis that parts them best: normals, and normals of pairs of edges.
-    """
-    X_BM = wall.pose().inverse().multiply(marker.X_WM)
-    normal, *edges = X_BM.rotation().matrix().T
-    axes = np.vstack([np.eye(3), normal, *(np.cross(np.eye(3), edge) for edge in edges)])
-    lengths = np.linalg.norm(axes, axis=1, keepdims=True)
-    axes = (axes / np.maximum(lengths, 1e-9))[lengths[:, 0] > 1e-9]
-    reach = np.abs(axes) @ np.array([wall.length, wall.thickness, wall.height]) / 2
-    reach += np.abs(axes @ np.transpose(edges)).sum(axis=1) * marker.size / 2
-    return float((np.abs(axes @ X_BM.translation()) - reach).max())
-
-
-def check_free(arena: ArenaParameters, point: Sequence[float], radius: float, what: str) -> None:
-    """Raises `ValueError` for a point on the ground that has a wall within `radius`.
+def check_free(
+    arena: ArenaParameters,
+    point: Sequence[float],
+    radius: float,
+    what: str,
+    *,
+    moving: bool = False,
+) -> None:
+    """Raises `ValueError` for a point on the ground that has an obstacle within `radius`.
 
     Args:
         arena: the arena.
         point: (2,) m.
         radius: room that is needed, m.
         what: name of the point for the message, `waypoints[0]` for example.
+        moving: moving obstacles count too, where they stand at t = 0.
     """
-    for index, wall in enumerate(arena.walls):
-        gap = float(wall.distance(np.array([[*point, wall.height / 2]]))[0])
+    obstacles = list(arena.standing())
+    if moving:
+        obstacles += [(f"moving[{k}]", m.at_start()) for k, m in enumerate(arena.moving)]
+    for name, obstacle in obstacles:
+        gap = float(obstacle.footprint().distances_from(np.array([point], float))[0, 0])
         if gap < radius:
             where = "lies in" if gap < 0 else f"is {gap:.3f} m from"
             raise ValueError(
-                f"{what} = [{point[0]:g}, {point[1]:g}] {where} walls[{index}]: the robot "
+                f"{what} = [{point[0]:g}, {point[1]:g}] {where} {name}: the robot "
                 f"needs {radius:.3f} m of room"
             )
 
 
 def add_arena(plant: MultibodyPlant, arena: ArenaParameters, markers: MarkerMap) -> None:
-    """Adds ground, walls and marker boards to the plant's world.
+    """Adds ground, obstacles and marker boards to the plant's world.
+
+    Moving obstacles become the model instance `plants.moving.MODEL`, if there are any.
 
     Raises:
-        ValueError: a marker lies in a wall.
+        ValueError: a marker lies in an obstacle.
     """
     check_markers(arena, markers)
     world = plant.world_body()
@@ -146,13 +132,21 @@ def add_arena(plant: MultibodyPlant, arena: ArenaParameters, markers: MarkerMap)
     plant.RegisterVisualGeometry(
         world, RigidTransform([0.0, 0.0, -0.0105]), plate, "ground", _GROUND_COLOUR
     )
-    for index, wall in enumerate(arena.walls):
-        box = Box(wall.length, wall.thickness, wall.height)
-        name = f"wall_{index}"
-        plant.RegisterCollisionGeometry(world, wall.pose(), box, name, _FRICTION)
-        plant.RegisterVisualGeometry(world, wall.pose(), box, name, _WALL_COLOUR)
+    for label, obstacle in arena.standing():
+        X, shape, name = obstacle.pose(), obstacle.shape(), _geometry_name(label)
+        plant.RegisterCollisionGeometry(world, X, shape, name, _FRICTION)
+        plant.RegisterVisualGeometry(world, X, shape, name, _COLOURS[type(obstacle)])
+    if arena.moving:
+        add_moving_cylinders(plant, arena.moving, _FRICTION)
     for marker in markers:
         add_marker(plant, marker, markers)
+
+
+def _geometry_name(label: str) -> str:
+    """Returns `wall_0` for `walls[0]`, and so on."""
+    kind, index = label.rstrip("]").split("[")
+    singular = {"walls": "wall", "boxes": "box", "cylinders": "cylinder"}[kind]
+    return f"{singular}_{index}"
 
 
 def add_marker(plant: MultibodyPlant, marker: Marker, markers: MarkerMap) -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,9 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.systems.framework import DiagramBuilder
 
-from plants.arena import ArenaParameters, Wall, add_arena, check_free, check_markers
+from plants.arena import ArenaParameters, add_arena, check_free, check_markers
+from plants.moving import MovingCylinder
+from plants.obstacles import BoxObstacle, CylinderObstacle, Wall
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap
 
@@ -19,6 +20,17 @@ ARENA = ArenaParameters(
         Wall(start=[2.0, -2.0], end=[2.0, 2.0]),  # 50 mm thick: its near face is at x = 1.975
         Wall(start=[0.0, 1.0], end=[1.0, 2.0], thickness=0.1, height=0.4),
     ]
+)
+
+MOVING = MovingCylinder(radius=0.1, path=[[-1.0, 0.5], [-1.0, -0.5]], speed=0.2, height=0.4)
+FULL = ArenaParameters(
+    walls=ARENA.walls,
+    boxes=[
+        BoxObstacle(position=[-1.0, -1.0], size=[0.4, 0.2, 0.3], heading_deg=90.0),
+        BoxObstacle(position=[-1.0, 1.5], size=[0.3, 0.3, 0.5], heading_deg=30.0),
+    ],
+    cylinders=[CylinderObstacle(position=[0.5, -1.0], radius=0.2, height=0.5)],
+    moving=[MOVING],
 )
 
 
@@ -31,51 +43,20 @@ def on_the_wall(x: float, y: float = 0.0, z: float = 0.3, yaw: float = np.pi) ->
     return RigidTransform(RollPitchYaw(0.0, 0.0, yaw), [x, y, z])
 
 
-def test_distances_from_a_wall() -> None:
-    wall = Wall(start=[0.0, 0.0], end=[2.0, 0.0], thickness=0.1, height=1.0)
-    points = {
-        (1.0, 0.5, 0.5): 0.45,  # beside
-        (1.0, -0.5, 0.5): 0.45,
-        (3.0, 0.0, 0.5): 1.0,  # beyond its end
-        (2.3, 0.45, 0.5): 0.5,  # off its corner: 3, 4, 5
-        (1.0, 0.0, 1.5): 0.5,  # above
-        (1.0, 0.0, 0.5): -0.05,  # inside: the face is 50 mm away
-        (1.98, 0.0, 0.5): -0.02,
-    }
-    np.testing.assert_allclose(wall.distance(np.array(list(points))), list(points.values()))
-
-
-def test_a_wall_at_an_angle_has_the_distances_of_one_that_is_not() -> None:
-    rng = np.random.default_rng(0)
-    straight = Wall(start=[-1.0, 0.0], end=[1.0, 0.0])
-    turn = RigidTransform(RollPitchYaw(0, 0, 0.7), [3.0, -2.0, 0.0])
-    ends = [turn.multiply(np.array([x, 0.0, 0.0]))[:2].tolist() for x in (-1.0, 1.0)]
-    askew = Wall(start=ends[0], end=ends[1])
-    assert askew.length == pytest.approx(2.0)
-    points = rng.uniform(-2, 2, (50, 3))
-    np.testing.assert_allclose(
-        askew.distance(turn.multiply(points.T).T), straight.distance(points), atol=1e-12
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"start": [0.0]}, "start is .*: must be"),
-        ({"end": [0.0, math.nan]}, "end is .*: must be"),
-        ({"end": [0.0, 0.0]}, "end is .*: must be another point than start"),
-        ({"thickness": 0.0}, "thickness is 0.0: must be greater than 0"),
-        ({"height": -1.0}, "height is -1.0: must be greater than 0"),
-    ],
-)
-def test_a_wall_of_nonsense_is_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        Wall(**({"start": [0.0, 0.0], "end": [1.0, 0.0]} | change))
-
-
 def test_an_arena_of_nonsense_is_refused() -> None:
     with pytest.raises(ValueError, match="ground is 0: must be greater than 0"):
         ArenaParameters(ground=0)
+    through = MovingCylinder(radius=0.1, path=[[0.0, 0.0], [3.0, 0.0]], speed=0.2)
+    with pytest.raises(
+        ValueError, match=r"moving\[1\]: its path leads through walls\[0\]: 1\.125 m"
+    ):
+        ArenaParameters(walls=ARENA.walls, moving=[MOVING, through])
+    beside = MovingCylinder(radius=0.1, path=[[0.0, 0.0], [1.0, 0.0], [1.0, -1.0]], speed=0.2)
+    pole = CylinderObstacle(position=[1.15, -0.5], radius=0.1)
+    with pytest.raises(
+        ValueError, match=r"moving\[0\]: its path leads through cylinders\[0\]: 0\.050"
+    ):
+        ArenaParameters(cylinders=[pole], moving=[beside])
 
 
 @pytest.mark.parametrize(
@@ -151,6 +132,52 @@ def test_points_without_room_are_refused_by_name() -> None:
         check_free(ARENA, [0.5, 1.5], 0.1, "start")
 
 
+@pytest.mark.parametrize(
+    ("X_WM", "name"),
+    [
+        (on_the_wall(-1.0, -1.0, 0.2), "boxes\\[0\\]"),
+        (on_the_wall(-0.8995, -1.0, 0.2, yaw=0.0), "boxes\\[0\\]"),  # half a millimetre before it
+        (on_the_wall(-1.0, 1.5, 0.3), "boxes\\[1\\]"),
+        (on_the_wall(0.6, -0.9, 0.3), "cylinders\\[0\\]"),
+    ],
+)
+def test_a_marker_in_a_box_or_cylinder_is_refused_by_name(X_WM: RigidTransform, name: str) -> None:
+    with pytest.raises(ValueError, match=rf"marker 7 is -?0\.\d+ m from {name}: must be at least"):
+        build(FULL, a_marker(X_WM))
+
+
+def test_markers_before_and_above_boxes_and_cylinders_are_welcome() -> None:
+    for X_WM in (
+        on_the_wall(-0.898, -1.0, 0.2, yaw=0.0),
+        on_the_wall(-1.0, -1.0, 0.4),
+        on_the_wall(0.5, -1.0, 0.6),
+        on_the_wall(0.702, -1.0, 0.3, yaw=0.0),
+    ):
+        check_markers(FULL, a_marker(X_WM))
+
+
+@pytest.mark.parametrize(
+    ("point", "said"),
+    [
+        ([-1.0, -1.1], r"lies in boxes\[0\]: the robot needs 0\.200 m of room"),
+        ([-0.75, -1.0], r"is 0\.150 m from boxes\[0\]"),
+        ([-1.0, 1.5], r"lies in boxes\[1\]"),
+        ([0.5, -0.9], r"lies in cylinders\[0\]"),
+        ([0.5, -0.65], r"is 0\.150 m from cylinders\[0\]"),
+    ],
+)
+def test_points_at_boxes_and_cylinders_are_refused_by_name(point: list[float], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        check_free(FULL, point, 0.2, "waypoints[0]")
+
+
+def test_of_what_moves_only_the_start_has_to_keep_away() -> None:
+    check_free(FULL, [-1.0, 0.5], 0.2, "waypoints[0]")
+    check_free(FULL, [-1.0, 0.0], 0.2, "robot.start", moving=True)  # it comes there later
+    with pytest.raises(ValueError, match=r"robot\.start = \[-1, 0\.45\] lies in moving\[0\]"):
+        check_free(FULL, [-1.0, 0.45], 0.2, "robot.start", moving=True)
+
+
 def build(arena: ArenaParameters, markers: MarkerMap) -> Any:
     builder = DiagramBuilder()
     plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
@@ -160,7 +187,7 @@ def build(arena: ArenaParameters, markers: MarkerMap) -> Any:
 
 
 def test_the_arena_stands_in_drake_as_it_is_described() -> None:
-    diagram, scene_graph = build(ARENA, a_marker(on_the_wall(1.9)))
+    diagram, scene_graph = build(FULL, a_marker(on_the_wall(1.9)))
     context = diagram.CreateDefaultContext()
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
     inspector = query.inspector()
@@ -174,11 +201,23 @@ def test_the_arena_stands_in_drake_as_it_is_described() -> None:
         )
 
     rng = np.random.default_rng(1)
-    for k, wall in enumerate(ARENA.walls):
-        by_drake = geometry(f"wall_{k}")
-        for p in rng.uniform([-1, -1, 0.01], [3, 3, 1], (20, 3)):
-            assert by_drake(p) == pytest.approx(wall.distance(p)[0], abs=1e-9)
+    boxes: dict[str, list[Any]] = {"wall": list(FULL.walls), "box": list(FULL.boxes)}
+    for name, kind in boxes.items():
+        for k, box in enumerate(kind):
+            by_drake = geometry(f"{name}_{k}")
+            for p in rng.uniform([-1, -1, 0.01], [3, 3, 1], (20, 3)):
+                assert by_drake(p) == pytest.approx(box.distance(p)[0], abs=1e-9)
+    for name, x, y, top in (("cylinder_0", 0.5, -1.0, 0.5), ("moving_0", -1.0, 0.5, 0.401)):
+        by_drake, radius = geometry(name), 0.2 if name == "cylinder_0" else 0.1
+        assert by_drake([x + 0.5, y, 0.3]) == pytest.approx(0.5 - radius)
+        assert by_drake([x, y - 0.5, 0.3]) == pytest.approx(0.5 - radius)
+        assert by_drake([x, y, 1.0]) == pytest.approx(1.0 - top)
     assert geometry("ground")([40.0, -40.0, 0.5]) == pytest.approx(0.5)
+    # Whatever one bumps into is seen by cameras and by who watches.
+    for name in ("wall_0", "box_1", "cylinder_0", "moving_0"):
+        for role in (Role.kProximity, Role.kPerception, Role.kIllustration):
+            ids = inspector.GetGeometryIds(GeometrySet(inspector.GetAllGeometryIds()), role)
+            assert sum(inspector.GetName(g).endswith(name) for g in ids) == 1
     # A marker is seen, not touched.
     for role, count in ((Role.kPerception, 2), (Role.kIllustration, 2), (Role.kProximity, 0)):
         ids = inspector.GetGeometryIds(GeometrySet(inspector.GetAllGeometryIds()), role)
