@@ -22,7 +22,8 @@ from systems.io.ros_motion import (
     planar_pose_to_ros,
     pose_from_ros,
 )
-from systems.messages import CameraImage, Detections
+from systems.io.ros_wheels import wheel_angles_from_ros, wheel_angles_to_ros
+from systems.messages import CameraImage, Detections, Scan
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,21 @@ def command_signal(device: str, rate: float) -> Signal:
     )
 
 
+def ticks_signal(device: str, rate: float, ticks_per_turn: float) -> Signal:
+    """Returns the signal of wheel encoders; the message has the angles that they count."""
+    angle = 2 * np.pi / ticks_per_turn
+    return Signal(
+        port=f"{device}.ticks",
+        topic=topic_of(device),
+        encode=lambda value, t: wheel_angles_to_ros(
+            angle * value, stamp=t, frame_id=device.replace(".", "/")
+        ),
+        decode=lambda message: np.rint(wheel_angles_from_ros(message) / angle),
+        model=2,
+        rate=rate,
+    )
+
+
 def image_signal(device: str, rate: float) -> Signal:
     """Returns the signal of a camera's pictures."""
     return Signal(
@@ -140,6 +156,18 @@ def detections_signal(device: str, rate: float) -> Signal:
         encode="apriltag_msgs/msg/AprilTagDetectionArray",
         decode=None,
         model=Detections(),
+        rate=rate,
+    )
+
+
+def scan_signal(device: str, rate: float) -> Signal:
+    """Returns the signal of a lidar's scans."""
+    return Signal(
+        port=f"{device}.scan",
+        topic=topic_of(f"{device}.scan"),
+        encode="sensor_msgs/msg/LaserScan",
+        decode=None,
+        model=Scan(),
         rate=rate,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import logging
 import math
@@ -10,11 +11,14 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
+
+if TYPE_CHECKING:
+    from diagrams.study_report import TextTable
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
 
@@ -74,6 +78,25 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--no-meshcat", action="store_true", help="neither show nor write a replay")
     run.add_argument("--play", metavar="RECORDING", help="sensors come from this recording")
 
+    study = command("study", _study, "do many seeded runs, also of variants, and compare them")
+    study.add_argument("scenario", help="bundled name or path of a scenario file")
+    study.add_argument(
+        "--runs", type=int, default=30, metavar="N", help="of each variant, seeds 0 to N-1 [30]"
+    )
+    study.add_argument("--workers", type=int, metavar="N", help="processes [one for each core]")
+    study.add_argument(
+        "--sweep",
+        action="append",
+        default=[],
+        metavar="KEY=A,B,C",
+        help="a variant for each value; several make all combinations",
+    )
+    study.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    study.add_argument(
+        "--out", type=Path, metavar="DIR", help="folder of the results [out/study/SCENARIO]"
+    )
+    study.add_argument("--keep", action="store_true", help="keep each run's folder too")
+
     diagram = command("diagram", _diagram, "draw a scenario's block diagram")
     diagram.add_argument("scenario")
     diagram.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
@@ -130,6 +153,31 @@ def _run(options: argparse.Namespace) -> int:
     return 0 if run.succeeded else 1
 
 
+def _study(options: argparse.Namespace) -> int:
+    from diagrams.study import load_study, run_study
+    from diagrams.study_plots import plot_study
+    from diagrams.study_report import summarize, text_tables, write_summary
+
+    study = load_study(options.scenario, options.set, options.sweep)
+    out = options.out or Path("out") / "study" / study.scenario
+    with _progress(digits=0) as progress:
+        records = run_study(
+            study,
+            runs=options.runs,
+            out=out,
+            workers=options.workers,
+            keep=options.keep,
+            progress=progress,
+        )
+    summary = summarize(study, records)
+    write_summary(summary, out)
+    plot_study(out / "summary.png", study, records)
+    for table in text_tables(summary):
+        _print_table(table)
+    console.print(f"results: {out}")
+    return 0
+
+
 def _diagram(options: argparse.Namespace) -> int:
     from diagrams.draw import write_diagram
     from diagrams.scenario import load_scenario
@@ -179,7 +227,7 @@ def _detect(options: argparse.Namespace) -> int:
 
 
 @contextmanager
-def _progress() -> Iterator[Callable[[float, float], None]]:
+def _progress(digits: int = 1) -> Iterator[Callable[[float, float], None]]:
     """Shows a progress bar; yields what is called with the amount done and the whole."""
     bar = Progress(
         TextColumn("{task.description}"),
@@ -194,10 +242,22 @@ def _progress() -> Iterator[Callable[[float, float], None]]:
 
         def show(done: float, whole: float) -> None:
             known = math.isfinite(whole)
-            text = f"{done:.1f} / {whole:.1f}" if known else f"{done:.0f}"
+            text = f"{done:.{digits}f} / {whole:.{digits}f}" if known else f"{done:.0f}"
             bar.update(task, completed=done, total=whole if known else None, description=text)
 
         yield show
+
+
+def _print_table(content: TextTable) -> None:
+    table = RichTable(title=content.title)
+    for column in content.header:
+        table.add_column(column, overflow="fold")
+    rows = iter(content.rows)
+    for length in content.groups:
+        for row in itertools.islice(rows, length):
+            table.add_row(*row)
+        table.add_section()
+    console.print(table)
 
 
 def _print_report(report: dict[str, object]) -> None:

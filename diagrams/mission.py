@@ -104,6 +104,20 @@ class Wiring:
             return False
         return True
 
+    def has_block(self, name: str) -> bool:
+        """Whether a block was added under that name."""
+        return name in self._blocks
+
+    def value(self, name: str, context: Context) -> Any:
+        """Returns what an output port says, once the diagram is built.
+
+        Args:
+            name: as `output` takes it.
+            context: of the whole diagram.
+        """
+        port = self.output(name)
+        return port.Eval(port.get_system().GetMyContextFromRoot(context))
+
     def connect(self, source: str, target: str) -> None:
         """Connects two ports by name.
 

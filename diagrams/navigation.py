@@ -15,8 +15,16 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import Multiplexer
 
+from diagrams.avoidance import AVOIDERS, PLANNERS, Avoidance
 from diagrams.channels import estimate_signal
-from diagrams.metrics import PoseLog, path_length, pose_metrics
+from diagrams.metrics import (
+    PoseLog,
+    clearance_metrics,
+    integrated_jerk,
+    nis_mean,
+    path_length,
+    pose_metrics,
+)
 from diagrams.mission import FRAME_RATE, Mission, Wiring
 from diagrams.plots import plot_navigation
 from diagrams.scenario import Scenario
@@ -26,14 +34,23 @@ from diagrams.trajectories import write_tum
 from diagrams.viewer import EstimateViewer
 from plants.arena import check_free
 from systems.angles import spatial_pose
+from systems.controllers.collision_monitor import CollisionMonitorParameters
 from systems.controllers.search import SearchParameters, SearchWhenLost
 from systems.estimators.planar_kalman import UNKNOWN
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.localizer import Localizer, LocalizerParameters, MapLocalizer
+from systems.planners.occupancy import OccupancyParameters
+from systems.planners.progress import ProgressParameters
 from systems.planners.waypoint_sequencer import WaypointSequencer
 from systems.validation import require, require_positive
 
-ESTIMATORS = Table("estimator", {"kf": "systems.estimators.planar_kalman:PlanarKalmanFilter"})
+ESTIMATORS = Table(
+    "estimator",
+    {
+        "ekf": "systems.estimators.planar_ekf:PlanarEkf",
+        "kf": "systems.estimators.planar_kalman:PlanarKalmanFilter",
+    },
+)
 CONTROLLERS = Table(
     "controller",
     {"waypoint": "systems.controllers.waypoints:WaypointController"},
@@ -54,10 +71,18 @@ class NavigationScenario(Scenario):
         arrival_radius: a waypoint counts as reached inside this distance, m.
         camera: which of the sensors looks for markers.
         imu: which of the sensors measures the yaw rate.
+        lidar: which of the sensors scans for obstacles; none without one.
         localizer: what is trusted of a picture.
         estimator: a block with the ports command, imu, marker_pose, marker_alternative, pose,
-            covariance.
+            covariance; nis if it has any.
         controller: a block with the ports pose, goal, command.
+        planner: finds the way around what the lidar has seen: a block with the ports pose, goal,
+            grid, path; `none` heads straight for the waypoint.
+        mapper: how the planner's grid is built.
+        avoider: keeps off what the lidar sees: a block with the ports pose, goal, scan, command,
+            state; with an output `command` it takes the controller's place. Or `none`.
+        monitor: when the wheels are slowed and stopped before a contact.
+        progress: when a robot that comes no nearer to its waypoint gives up.
         search: what to do while lost.
     """
 
@@ -67,9 +92,15 @@ class NavigationScenario(Scenario):
     arrival_radius: float = 0.30
     camera: str = "front_camera"
     imu: str = "imu"
+    lidar: str | None = None
     localizer: LocalizerParameters = field(default_factory=LocalizerParameters)
     estimator: Annotated[Choice, ESTIMATORS]
     controller: Annotated[Choice, CONTROLLERS]
+    planner: Annotated[Choice | None, PLANNERS] = None
+    mapper: OccupancyParameters = field(default_factory=OccupancyParameters)
+    avoider: Annotated[Choice | None, AVOIDERS] = None
+    monitor: CollisionMonitorParameters = field(default_factory=CollisionMonitorParameters)
+    progress: ProgressParameters = field(default_factory=ProgressParameters)
     search: SearchParameters = field(default_factory=SearchParameters)
 
     def __post_init__(self) -> None:
@@ -83,8 +114,18 @@ class NavigationScenario(Scenario):
                 point,
                 "[x, y] in metres",
             )
-        for key, method in (("camera", "mounting"), ("imu", "add")):
+        if self.lidar is None:
+            for key in ("planner", "avoider"):
+                require(
+                    getattr(self, key) is None,
+                    "lidar",
+                    None,
+                    f"one of the sensors, or {key}: none",
+                )
+        for key, method in (("camera", "model"), ("imu", "add"), ("lidar", "planar_mounting")):
             name = getattr(self, key)
+            if name is None:
+                continue
             fit = [n for n, s in self.robot.sensors.items() if hasattr(s.target, method)]
             have = ", ".join(fit) or "none"
             require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
@@ -92,7 +133,7 @@ class NavigationScenario(Scenario):
         for k, point in enumerate(self.waypoints):
             check_free(self.world.arena, point, room, f"waypoints[{k}]")
         start = self.robot.start
-        check_free(self.world.arena, [start.x, start.y], room, "robot.start")
+        check_free(self.world.arena, [start.x, start.y], room, "robot.start", moving=True)
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:
         """Wires station, estimator and controller.
@@ -120,14 +161,17 @@ class NavigationMission(Mission):
         self.station = wiring.station
         self._scenario = scenario
         self._add_blocks(wiring)
+        self._avoidance = Avoidance(wiring, scenario, ROBOT)
         _connect(wiring, scenario)
+        self._avoidance.connect()
         self._has_truth = wiring.has_output(f"truth.{ROBOT}.pose")
         self._log_and_record(wiring)
         if meshcat is not None:
             _show(wiring, scenario, meshcat, self._has_truth)
+            self._avoidance.show(meshcat)
         self.recorder = wiring.add_recorder(out)
         self.diagram, self.logs = wiring.build("navigation")
-        self._sequencer = self.diagram.GetSubsystemByName("sequencer")
+        self._wiring = wiring
 
     def _add_blocks(self, wiring: Wiring) -> None:
         scenario = self._scenario
@@ -154,9 +198,8 @@ class NavigationMission(Mission):
                 wiring.output(f"estimator.{port}"), together.get_input_port(index)
             )
         names = ["estimator.pose", "estimator.covariance", "sequencer.waypoints_reached"]
-        if self._has_truth:
-            names.append(f"truth.{ROBOT}.pose")
-        for name in names:
+        truth = [f"truth.{ROBOT}.{kind}" for kind in ("pose", "clearance", "contacts")]
+        for name in [*names, *filter(wiring.has_output, ["estimator.nis", *truth])]:
             wiring.log(name)
         signal = estimate_signal(ROBOT, rate=50.0)
         wiring.record("estimate.y0", signal)
@@ -165,10 +208,20 @@ class NavigationMission(Mission):
         )
 
     def outcome(self, context: Context) -> str | None:
-        """Returns `reached` when the last waypoint is."""
-        own = self._sequencer.GetMyContextFromRoot(context)
-        reached = self._sequencer.GetOutputPort("waypoints_reached").Eval(own)[0]
-        return "reached" if reached == len(self._scenario.waypoints) else None
+        """Returns `reached` when the last waypoint is, `blocked` when the robot gives up.
+
+        A run in which the robot touched something ends as `contact`, wherever it got to.
+        """
+        reached = self._wiring.value("sequencer.waypoints_reached", context)[0]
+        if reached == len(self._scenario.waypoints):
+            return "contact" if self._touched(context) else "reached"
+        if self._avoidance.blocked(context):
+            return "contact" if self._touched(context) else "blocked"
+        return None
+
+    def _touched(self, context: Context) -> bool:
+        name = f"truth.{ROBOT}.contacts"
+        return self._wiring.has_output(name) and self._wiring.value(name, context)[0] > 0
 
     def succeeded(self, outcome: str) -> bool:
         """Whether all waypoints were reached."""
@@ -178,16 +231,31 @@ class NavigationMission(Mission):
         """Returns the metrics (see `diagrams.metrics`)."""
         log = self.pose_log(context)
         reached = int(self.log("sequencer.waypoints_reached", context)[1][-1, 0])
-        done = self.outcome(context) is not None
+        total = len(self._scenario.waypoints)
+        now = int(self._wiring.value("sequencer.waypoints_reached", context)[0])
         path = log.estimate[log.known] if log.truth is None else log.truth
         return {
-            "waypoints_reached": len(self._scenario.waypoints) if done else reached,
-            "waypoints_total": len(self._scenario.waypoints),
+            "waypoints_reached": max(now, reached),
+            "waypoints_total": total,
             **pose_metrics(log),
+            "nis_mean": self._nis_mean(context),
             "path_length_m": path_length(path[:, :2]),
+            "integrated_jerk": None if log.truth is None else integrated_jerk(log.t, path[:, :2]),
+            **self._clearance(context),
             "time_to_first_fix_s": float(log.t[log.known][0]) if log.known.any() else None,
-            "time_to_goal_s": context.get_time() if done else None,
+            "time_to_goal_s": context.get_time() if now == total else None,
         }
+
+    def _nis_mean(self, context: Context) -> float | None:
+        name = "estimator.nis"
+        return nis_mean(self.log(name, context)[1]) if name in self.logs else None
+
+    def _clearance(self, context: Context) -> dict[str, Any]:
+        names = [f"truth.{ROBOT}.{kind}" for kind in ("clearance", "contacts")]
+        if not all(name in self.logs for name in names):
+            return dict.fromkeys(("contacts", "min_clearance_m", "mean_clearance_m"))
+        clearance, contacts = (self.log(name, context)[1][:, 0] for name in names)
+        return clearance_metrics(clearance, contacts)
 
     def pose_log(self, context: Context) -> PoseLog:
         """Returns truth and estimate over time."""
@@ -207,7 +275,7 @@ class NavigationMission(Mission):
             log,
             waypoints=np.array(self._scenario.waypoints),
             radius=self._scenario.arrival_radius,
-            walls=self._scenario.world.arena.walls,
+            arena=self._scenario.world.arena,
             markers=self.station.marker_map,
         )
 
@@ -221,10 +289,7 @@ def _connect(wiring: Wiring, scenario: NavigationScenario) -> None:
     wiring.connect_if_wanted("localizer.alternative", "estimator.marker_alternative")
     wiring.connect("estimator.pose", "sequencer.pose")
     wiring.connect_if_wanted("estimator.pose", "controller.pose")
-    wiring.connect_if_wanted("sequencer.goal", "controller.goal")
-    wiring.connect("controller.command", "search.command")
     wiring.connect("estimator.covariance", "search.covariance")
-    wiring.connect("search.command", f"{ROBOT}.drive.command")
 
 
 def _show(wiring: Wiring, scenario: NavigationScenario, meshcat: Meshcat, has_truth: bool) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from diagrams.metrics import NEES_BOUNDS, PoseLog, nees
 from diagrams.viewer import ellipse
-from plants.arena import Wall
+from plants.arena import ArenaParameters
 from systems.markers.layout import MarkerMap
 
 Array = NDArray[np.float64]
@@ -30,8 +30,8 @@ def plot_navigation(
     *,
     waypoints: Array,
     radius: float,
-    walls: list[Wall],
     markers: MarkerMap,
+    arena: ArenaParameters,
 ) -> None:
     """Writes the figure of a navigation run: plan view, errors with their bounds, NEES.
 
@@ -40,13 +40,13 @@ def plot_navigation(
         log: truth and estimate.
         waypoints: (n, 2) m.
         radius: arrival radius, m.
-        walls: of the arena.
         markers: of the world.
+        arena: its obstacles.
     """
     figure = Figure(figsize=(12.0, 6.2), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = cast(NDArray[Any], figure.subfigures(1, 2, width_ratios=[1.0, 1.05]))
-    _plan(left.subplots(), log, waypoints, radius, walls, markers)
+    _plan(left.subplots(), log, waypoints, radius, arena, markers)
     axes = right.subplots(4 if log.truth is not None else 3, 1, sharex=True)
     if not log.known.any():
         axes[0].set_title("no marker was ever seen: there is no estimate")
@@ -63,15 +63,10 @@ def _plan(
     log: PoseLog,
     waypoints: Array,
     radius: float,
-    walls: list[Wall],
+    arena: ArenaParameters,
     markers: MarkerMap,
 ) -> None:
-    for wall in walls:
-        X = wall.pose()
-        half = np.array([wall.length, wall.thickness]) / 2
-        corners = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) * half
-        outline = X.multiply(np.column_stack([corners, np.zeros(4)]).T).T[:, :2]
-        ax.add_patch(Polygon(outline, facecolor="0.8", edgecolor="0.5"))
+    draw_arena(ax, arena)
     for marker in markers:
         p = marker.X_WM.translation()[:2]
         across = marker.X_WM.rotation().matrix()[:2, 1] * marker.size / 2
@@ -107,6 +102,23 @@ def _plan(
     ax.set_xlabel("x [m]")
     ax.set_ylabel("y [m]")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, 1.12), ncol=3, fontsize=8, frameon=False)
+
+
+def draw_arena(ax: Axes, arena: ArenaParameters) -> None:
+    """Draws what stands filled, and what moves as outlines at both ends of its dashed path."""
+    filled: dict[str, Any] = {"facecolor": "0.8", "edgecolor": "0.5"}
+    for box in [*arena.walls, *arena.boxes]:
+        ax.add_patch(Polygon(box.footprint().corners()[0], **filled))
+    for cylinder in arena.cylinders:
+        ax.add_patch(
+            Circle((cylinder.position[0], cylinder.position[1]), cylinder.radius, **filled)
+        )
+    for moving in arena.moving:
+        ax.plot(*np.transpose(moving.path), color="0.5", linestyle=(0, (2, 2)), linewidth=1.0)
+        for x, y in (moving.path[0], moving.path[-1]):
+            ax.add_patch(Circle((x, y), moving.radius, facecolor="none", edgecolor="0.5"))
+    if arena.moving:
+        ax.plot([], [], color="0.5", linestyle=(0, (2, 2)), linewidth=1, label="moving obstacle")
 
 
 def _errors(axes: Array, log: PoseLog) -> None:

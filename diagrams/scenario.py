@@ -2,7 +2,8 @@
 
 Later layers override earlier ones: the defaults of the dataclasses, the file that `extends` names,
 the file, `--set KEY=VALUE`. Mappings are merged key by key; everything else is replaced. A block
-whose `type` changes starts anew; a word overrides a block's type alone.
+whose `type` changes starts anew; a word overrides a block's type alone. A world that comes from the
+seed is drawn when all layers are there (see `diagrams.random_world`).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 from ruamel.yaml import YAML, YAMLError
 
+from diagrams.random_world import asks_for_random, draw_world, make_way
 from diagrams.schema import (
     OVERRIDE,
     Existing,
@@ -24,6 +26,7 @@ from diagrams.schema import (
     ScenarioError,
     bundled_folder,
     convert,
+    field_hints,
     to_plain,
 )
 from diagrams.tables import Table
@@ -148,10 +151,10 @@ def load_scenario(name: str, overrides: Iterable[str] | Mapping[str, Any] = ()) 
     items = (
         overrides.items()
         if isinstance(overrides, Mapping)
-        else [_parse_override(text) for text in overrides]
+        else [parse_override(text) for text in overrides]
     )
     for key, value in items:
-        _set(layers, key, value)
+        set_value(layers, key, value)
     return check(layers)
 
 
@@ -163,7 +166,10 @@ def check(layers: Layers) -> Any:
     mission = convert(layers.data["mission"], str, place / "mission")
     # The mission's scenario class says which other keys there are.
     name, target = MISSIONS.target(mission, place / "mission")
-    return convert(layers.data | {"mission": name}, target, place)
+    data = layers.data | {"mission": name}
+    if asks_for_random(data):
+        data, place = draw_world(data, field_hints(target), place)
+    return convert(data, target, place)
 
 
 def read_layers(path: Path, seen: tuple[Path, ...] = ()) -> Layers:
@@ -201,7 +207,8 @@ def read_layers(path: Path, seen: tuple[Path, ...] = ()) -> Layers:
     layers.folders.insert(0, path.parent)
     origins: dict[Key, str] = {(): str(path)}
     _note_lines(content, (), str(path), origins)
-    layers.data = merge(layers.data, to_plain(content))
+    top = to_plain(content)
+    layers.data = merge(make_way(layers.data, top), top)
     layers.origins |= origins
     return layers
 
@@ -282,21 +289,29 @@ def _note_override(value: Any, key: Key, text: str, origins: dict[Key, str]) -> 
         _note_override(item, (*key, step), text, origins)
 
 
-def _parse_override(text: str) -> tuple[str, Any]:
+def parse_override(text: str) -> tuple[str, Any]:
+    """Returns key and value of an override KEY=VALUE.
+
+    Raises:
+        ScenarioError: it has not that form, or the value is not YAML.
+    """
     key, equals, value = text.partition("=")
     if not equals or not key:
         raise ScenarioError(f"--set {text}: must be KEY=VALUE")
     return key.strip(), parse_value(value.strip())
 
 
-def _set(layers: Layers, dotted: str, value: Any) -> None:
+def set_value(layers: Layers, dotted: str, value: Any) -> None:
     """Lays one override over the data; numbers in the key are indices of lists."""
     steps: list[str | int] = [int(s) if s.isdigit() else s for s in dotted.split(".")]
     text = f"{OVERRIDE}{dotted}"
     for depth in range(1, len(steps)):
         layers.origins.setdefault(tuple(steps[:depth]), text)
     _note_override(value, tuple(steps), text, layers.origins)
-    layers.data = _set_in(layers.data, steps, value, text)
+    top = value
+    for step in reversed(steps):
+        top = {str(step): top}
+    layers.data = _set_in(make_way(layers.data, top), steps, value, text)
 
 
 def _set_in(data: Any, steps: list[str | int], value: Any, what: str) -> Any:

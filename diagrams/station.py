@@ -24,13 +24,12 @@ from pydrake.multibody.plant import (
     MultibodyPlantConfig,
 )
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
-from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from diagrams.channels import Signal
 from diagrams.schema import File, ScenarioError, file_path
+from diagrams.surroundings import add_clearance, add_motion, show_twins
 from diagrams.tables import Choice, Table
 from plants.arena import ArenaParameters, add_arena
-from plants.body_state import TwinPositions
 from plants.lighting import daylight
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.family import family
@@ -46,15 +45,28 @@ BODIES = Table(
     {"differential_drive": "diagrams.drivers.body:DifferentialDriveBody"},
     method="add_model",
 )
-DRIVES = Table("drive", {"wheel_servo": "diagrams.drivers.drive:WheelServo"}, method="add")
+DRIVES = Table(
+    "drive",
+    {
+        "dc_motors": "diagrams.drivers.drive:DcMotorDrive",
+        "wheel_servo": "diagrams.drivers.drive:WheelServo",
+    },
+    method="add",
+)
 SENSORS = Table(
     "sensor",
-    {"camera": "diagrams.drivers.camera:Camera", "imu": "diagrams.drivers.imu:InertialSensor"},
+    {
+        "camera": "diagrams.drivers.camera:Camera",
+        "imu": "diagrams.drivers.imu:InertialSensor",
+        "lidar": "diagrams.drivers.lidar:Lidar",
+        "mpu6050": "diagrams.drivers.imu:Mpu6050",
+        "wheel_encoders": "diagrams.drivers.encoders:Encoders",
+    },
     method="add",
 )
 
 # Names of blocks, ports and topics of a robot that its devices must leave free.
-_TAKEN = ("drive", "estimate", "servos", "state", "twin")
+_TAKEN = ("drive", "estimate", "servos", "state", "twin", "wheels", "wheel_angles")
 
 RENDERER = "vtk"
 
@@ -124,9 +136,11 @@ class TagList:
 class WorldParameters:
     """What stands around the robots.
 
+    In a scenario it may come from the seed instead: see `diagrams.random_world`.
+
     Attributes:
         markers: a marker map's file (bundled, or beside the scenario), or the markers themselves.
-        arena: ground and walls.
+        arena: ground and obstacles.
     """
 
     markers: Annotated[str, File("maps")] | TagList
@@ -196,20 +210,26 @@ class Robot:
         name: prefix of its ports.
         body: its body's driver.
         start: [x, y, theta].
+        drive: the driver of its wheels.
         model: its model instance in the plant.
         frame_id: geometry frame of its base_link.
         state: block with the outputs pose, planar_pose, spatial_velocity, spatial_acceleration.
-        wheel_speeds: input port that takes [right, left] (rad/s).
+        wheel_speeds: input port that takes [right, left] (rad/s): how the wheels are to turn.
+        wheel_rates: output port of [right, left] (rad/s): how they turn.
+        wheel_angles: output port of [right, left] (rad); see the body's `wheel_angles`.
         twin: its kinematic twin, when there is one.
     """
 
     name: str
     body: DifferentialDriveBody
     start: np.ndarray
+    drive: Any = None
     model: Any = None
     frame_id: Any = None
     state: Any = None
     wheel_speeds: Any = None
+    wheel_rates: Any = None
+    wheel_angles: Any = None
     twin: Any = None
 
 
@@ -375,23 +395,27 @@ class Station(Diagram):
             player=player,
         )
         bodies = {
-            name: Robot(name, parameters.body.build(), parameters.start.pose())
+            name: Robot(
+                name, parameters.body.build(), parameters.start.pose(), parameters.drive.build()
+            )
             for name, parameters in robots.items()
         }
         if station.simulated:
             for robot in bodies.values():
                 robot.body.add_model(station.plant, robot)
         station.plant.Finalize()
+        moving = add_motion(station)
         for name, robot in bodies.items():
             if station.simulated:
                 robot.body.add_state(station, robot)
             else:
                 robot.body.play_state(station, robot)
-            robots[name].drive.build().add(station, robot)
+            robot.drive.add(station, robot)
             for device, sensor in robots[name].sensors.items():
                 sensor.build().add(station, robot, device)
-        if station.simulated and dynamics == "kinematic":
-            _show_twins(station, list(bodies.values()))
+            add_clearance(station, robot, moving)
+        if station.dynamics == "kinematic" and station.plant.num_positions() > 0:
+            show_twins(station, list(bodies.values()) if station.simulated else [])
         station.builder.ExportOutput(
             station.scene_graph.get_query_output_port(), "scene.query_object"
         )
@@ -404,22 +428,6 @@ class Station(Diagram):
         self.end_time = math.inf if station.simulated else station.end_time
         station.builder.BuildInto(self)
         self.set_name("station")
-
-
-def _show_twins(station: StationBuilder, robots: list[Robot]) -> None:
-    """Moves the robots' geometry with their kinematic twins."""
-    to_geometry = station.add(
-        MultibodyPositionToGeometryPose(station.plant, input_multibody_state=False), "twin_geometry"
-    )
-    source = station.plant.get_source_id()
-    station.connect(to_geometry.get_output_port(), station.scene_graph.get_source_pose_port(source))
-    positions = station.add(
-        TwinPositions(plant=station.plant, models=[robot.name for robot in robots]),
-        "twin_positions",
-    )
-    for robot in robots:
-        station.connect(robot.twin.pose_output_port(), positions.GetInputPort(robot.name))
-    station.connect(positions.get_output_port(), to_geometry.get_input_port())
 
 
 def _static_transforms(

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.multibody.plant import MultibodyPlant
-from pydrake.systems.framework import BasicVector
-from pydrake.systems.primitives import MatrixGain
+from pydrake.systems.framework import BasicVector, OutputPort
+from pydrake.systems.primitives import Demultiplexer, Integrator, MatrixGain, PassThrough
 
 from diagrams.channels import truth_signal
 from diagrams.station import Robot, StationBuilder
@@ -16,7 +16,9 @@ from plants.differential_drive import (
     DifferentialDriveParameters,
     KinematicDifferentialDrive,
     add_differential_drive,
+    hull,
     hull_radius,
+    servo_matrix,
     wheel_speeds,
 )
 from systems.angles import spatial_pose
@@ -37,13 +39,22 @@ class DifferentialDriveBody:
         """Radius of the circle that holds the robot, m."""
         return hull_radius(self.parameters)
 
+    @property
+    def hull(self) -> list[float]:
+        """[front, rear, half_width] of the rectangle about base_link that holds the robot, m."""
+        return hull(self.parameters)
+
     def to_wheel_speeds(self, command: np.ndarray) -> list[float]:
         """Returns [right, left] (rad/s) of a command [v, omega]."""
         return wheel_speeds(command, self.parameters)
 
     def add_model(self, plant: MultibodyPlant, robot: Robot) -> None:
-        """Adds the robot to the plant, at its start."""
-        robot.model = add_differential_drive(plant, self.parameters, robot.name)
+        """Adds the robot to the plant, at its start.
+
+        Its wheels are turned by the `motor` (a `MotorModel`) of its drive, else by speed servos.
+        """
+        motor = getattr(robot.drive, "motor", None)
+        robot.model = add_differential_drive(plant, self.parameters, robot.name, motor)
         body = plant.GetBodyByName("base_link", robot.model)
         plant.SetDefaultFloatingBaseBodyPose(body, spatial_pose(robot.start))
 
@@ -55,13 +66,19 @@ class DifferentialDriveBody:
         if station.dynamics == "multibody":
             robot.state = BodyState.AddToBuilder(station.builder, plant, robot.model)
             robot.state.set_name(f"{robot.name}.state")
-            # The servos follow the speeds; their gain on positions is zero.
-            to_servos = np.vstack([np.zeros((2, 2)), np.eye(2)])
-            servos = station.add(MatrixGain(to_servos), f"{robot.name}.servos")
+            servos = station.add(
+                MatrixGain(servo_matrix(plant, robot.model)), f"{robot.name}.servos"
+            )
             station.connect(
                 servos.get_output_port(), plant.get_desired_state_input_port(robot.model)
             )
             robot.wheel_speeds = servos.get_input_port()
+            others = (plant.num_positions(robot.model) - 2, plant.num_velocities(robot.model) - 2)
+            # The floating body's coordinates come first, the wheels' last, the right one's before.
+            wheels = Demultiplexer([others[0], 2, others[1], 2])
+            station.add(wheels, f"{robot.name}.wheels")
+            station.connect(plant.get_state_output_port(robot.model), wheels.get_input_port())
+            robot.wheel_angles, robot.wheel_rates = (wheels.get_output_port(k) for k in (1, 3))
         else:
             twin = KinematicDifferentialDrive(parameters=self.parameters)
             # Declared anew for its default value, which is where the robot starts.
@@ -71,12 +88,24 @@ class DifferentialDriveBody:
             for name in ("pose", "velocity"):
                 station.connect(twin.GetOutputPort(name), robot.state.GetInputPort(f"twin_{name}"))
             robot.twin = twin
-            robot.wheel_speeds = twin.wheel_speeds_input_port()
+            wheels = station.add(PassThrough(2), f"{robot.name}.wheels")
+            station.connect(wheels.get_output_port(), twin.wheel_speeds_input_port())
+            robot.wheel_speeds = wheels.get_input_port()
+            robot.wheel_rates = wheels.get_output_port()
         station.export_output(
             robot.state.GetOutputPort("planar_pose"),
             f"truth.{robot.name}.pose",
             truth_signal(robot.name),
         )
+
+    def wheel_angles(self, station: StationBuilder, robot: Robot) -> OutputPort:
+        """Returns the port of the wheels' angles [right, left] (rad); a twin has none until now."""
+        if robot.wheel_angles is None:
+            integrator = station.add(Integrator(2), f"{robot.name}.wheel_angles")
+            station.connect(robot.wheel_rates, integrator.get_input_port())
+            robot.wheel_angles = integrator.get_output_port()
+        port: OutputPort = robot.wheel_angles
+        return port
 
     def play_state(self, station: StationBuilder, robot: Robot) -> None:
         """Exports the truth of a recorded simulation, if the recording has it."""

@@ -2,12 +2,22 @@
 
 from __future__ import annotations
 
-from tests.benchmarks import bench_detector, bench_pose, bench_run
+from tests.benchmarks import (
+    bench_detector,
+    bench_filter,
+    bench_lidar,
+    bench_planner,
+    bench_pose,
+    bench_run,
+)
 from tests.benchmarks.table import show
 
 for title, module in (
     ("Detector", bench_detector),
     ("Poses from markers", bench_pose),
+    ("Lidar", bench_lidar),
+    ("Planar filters", bench_filter),
+    ("Planner, mapper and collision monitor", bench_planner),
     ("Bundled run", bench_run),
 ):
     show(title, module.rows())

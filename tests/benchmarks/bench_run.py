@@ -26,7 +26,7 @@ def rows() -> Iterator[Row]:
     """Yields the measurements, recording included."""
     for sight, factor in (("rendered", 2.0), ("projected", 15.0)):
         with tempfile.TemporaryDirectory() as folder:
-            scenario = load_scenario("navigation", {"sight": sight})
+            scenario = load_scenario("navigation_open", {"sight": sight})
             reports = [simulate(scenario, out=Path(folder)).report for _ in range(2)]
         metrics = reports[0]["metrics"]
         speed = max(report["real_time_factor"] for report in reports)  # what disturbs only slows
@@ -45,7 +45,7 @@ def rows() -> Iterator[Row]:
 
 def plant_alone(seconds: float = 10.0) -> float:
     """Returns how much faster than real time the plant is without the other blocks."""
-    scenario = load_scenario("navigation")
+    scenario = load_scenario("navigation_open")
     config = MultibodyPlantConfig(
         time_step=scenario.time_step, discrete_contact_approximation="lagged",
         use_sampled_output_ports=False,

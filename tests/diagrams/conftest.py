@@ -102,9 +102,9 @@ def picture() -> Callable[[Path], Path]:
 
 @pytest.fixture
 def write_scenario(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a scenario file; `extends: navigation` stands in its first line, unless told not."""
+    """Writes a scenario file whose first line, unless told not to, extends `navigation_open`."""
 
-    def write(text: str, name: str = "scene.yaml", extends: str | None = "navigation") -> Path:
+    def write(text: str, name: str = "scene.yaml", extends: str | None = "navigation_open") -> Path:
         path = tmp_path / name
         path.write_text((f"extends: {extends}\n" if extends else "") + text)
         return path
@@ -113,7 +113,7 @@ def write_scenario(tmp_path: Path) -> Callable[..., Path]:
 
 
 def _run(folder: Path, *arguments: str | Path) -> RunFolder:
-    result = command("run", "navigation", *arguments, "--out", folder)
+    result = command("run", "navigation_open", *arguments, "--out", folder)
     assert result.status in (0, 1), result.err
     assert result.err == ""
     return RunFolder(folder, result.status)
@@ -122,7 +122,7 @@ def _run(folder: Path, *arguments: str | Path) -> RunFolder:
 @pytest.fixture(scope="session")
 def navigation(tmp_path_factory: pytest.TempPathFactory) -> RunFolder:
     """The bundled scenario to its end: projected sight, multibody, seed 3."""
-    return _run(tmp_path_factory.mktemp("navigation"), *PROJECTED, "--seed", "3")
+    return _run(tmp_path_factory.mktemp("navigation_open"), *PROJECTED, "--seed", "3")
 
 
 @pytest.fixture(scope="session")

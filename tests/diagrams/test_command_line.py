@@ -28,9 +28,12 @@ Draw = Callable[[Path], Path]
         ((), "the following arguments are required: COMMAND"),
         (("walk",), "invalid choice: 'walk'"),
         (("run",), "the following arguments are required: scenario"),
-        (("run", "navigation", "--seed", "1.5"), "argument --seed: invalid int value: '1.5'"),
-        (("run", "navigation", "--duration", "long"), "argument --duration: invalid float value"),
-        (("run", "navigation", "--speed", "3"), "unrecognized arguments: --speed 3"),
+        (("run", "navigation_open", "--seed", "1.5"), "argument --seed: invalid int value: '1.5'"),
+        (
+            ("run", "navigation_open", "--duration", "long"),
+            "argument --duration: invalid float value",
+        ),
+        (("run", "navigation_open", "--speed", "3"), "unrecognized arguments: --speed 3"),
         (("detect", "x.png"), "the following arguments are required: --family"),
     ],
 )
@@ -43,7 +46,7 @@ def test_arguments_that_make_no_sense_are_refused_in_one_line(
 def test_help_shows_every_command(tagtrail: Callable[..., Any]) -> None:
     result = tagtrail("--help")
     assert result.status == 0
-    for command in ("list", "run", "diagram", "markers", "detect"):
+    for command in ("list", "run", "study", "diagram", "markers", "detect"):
         assert f"\n    {command} " in result.out
 
 
@@ -56,18 +59,18 @@ def test_help_shows_every_command(tagtrail: Callable[..., Any]) -> None:
         (("navigatoin",), "scenario 'navigatoin': no such file or bundled name; did you mean "
                           "'navigation'?"),
         (("nope.yaml",), "scenario nope.yaml: no such file"),
-        (("navigation", "--set", "seed"), "--set seed: must be KEY=VALUE"),
-        (("navigation", "--seed", "-1"),
+        (("navigation_open", "--set", "seed"), "--set seed: must be KEY=VALUE"),
+        (("navigation_open", "--seed", "-1"),
          "--set seed: seed is -1: must be a whole number from 0 to 2^53 - 1"),
-        (("navigation", "--seed", str(2**53)),
+        (("navigation_open", "--seed", str(2**53)),
          f"--set seed: seed is {2**53}: must be a whole number from 0 to 2^53 - 1"),
-        (("navigation", "--duration", "0"),
+        (("navigation_open", "--duration", "0"),
          "--set duration: duration is 0.0: must be greater than 0"),
-        (("navigation", "--duration", "nan"),
+        (("navigation_open", "--duration", "nan"),
          "--set duration: duration is 'nan': must be a number"),
-        (("navigation", "--realtime", "-1", "--no-meshcat"),
+        (("navigation_open", "--realtime", "-1", "--no-meshcat"),
          "realtime is -1.0: must be 0 or greater"),
-        (("navigation", "--play", "nope"),
+        (("navigation_open", "--play", "nope"),
          "--set recording: recording is 'nope': there is no such file or folder"),
     ],
 )  # fmt: skip
@@ -80,7 +83,7 @@ def test_a_run_that_cannot_be_is_refused_in_one_line(
 
 def scene(folder: Path, text: str) -> Path:
     path = folder / "scene.yaml"
-    path.write_text(f"extends: navigation\nsight: projected\n{text}")
+    path.write_text(f"extends: navigation_open\nsight: projected\n{text}")
     return path
 
 
@@ -146,12 +149,12 @@ def test_a_lens_that_cannot_be_rendered_is_refused_by_its_file(
 
 def test_results_that_cannot_be_written_are_refused(refuse: Refuse, workshop: Path) -> None:
     (workshop / "file").write_text("in the way")
-    assert refuse("run", "navigation", *SHORT, "--out", "file") == "--out file: File exists"
-    assert refuse("run", "navigation", *SHORT, "--out", "file/sub") == (
+    assert refuse("run", "navigation_open", *SHORT, "--out", "file") == "--out file: File exists"
+    assert refuse("run", "navigation_open", *SHORT, "--out", "file/sub") == (
         "--out file/sub: Not a directory"
     )
     (workshop / "results" / "scenario.yaml").mkdir(parents=True)
-    line = refuse("run", "navigation", *SHORT, "--out", "results")
+    line = refuse("run", "navigation_open", *SHORT, "--out", "results")
     assert line == "results/scenario.yaml: Is a directory"
 
 
@@ -160,11 +163,11 @@ def test_a_second_run_replaces_the_first_ones_results(
 ) -> None:
     out = workshop / "out"
     longer = [*SHORT[:-1], "0.4"]
-    assert tagtrail("run", "navigation", *longer, "--out", out).status == 1
+    assert tagtrail("run", "navigation_open", *longer, "--out", out).status == 1
     first = json.loads((out / "report.json").read_text())
     (out / "replay.html").write_text("of a run with Meshcat")
     (out / "notes.txt").write_text("the user's own")
-    again = tagtrail("run", "navigation", *SHORT, "--seed", "9", "--out", out)
+    again = tagtrail("run", "navigation_open", *SHORT, "--seed", "9", "--out", out)
     assert again.status == 1, again.err
     second = json.loads((out / "report.json").read_text())
     assert (first["sim_seconds"], second["sim_seconds"]) == (0.4, 0.2)
@@ -179,11 +182,11 @@ def test_a_second_run_replaces_the_first_ones_results(
 def test_a_refused_run_leaves_the_last_ones_results(
     refuse: Refuse, tagtrail: Callable[..., Any], workshop: Path
 ) -> None:
-    tagtrail("run", "navigation", *SHORT, "--out", "out")
+    tagtrail("run", "navigation_open", *SHORT, "--out", "out")
     before = {path: path.read_bytes() for path in (workshop / "out").rglob("*") if path.is_file()}
     (workshop / "empty.yaml").write_text("")
     camera = "robot.sensors.front_camera.calibration=empty.yaml"
-    refuse("run", "navigation", *SHORT, "--out", "out", "--set", camera)
+    refuse("run", "navigation_open", *SHORT, "--out", "out", "--set", camera)
     assert before == {p: p.read_bytes() for p in (workshop / "out").rglob("*") if p.is_file()}
 
 
@@ -193,10 +196,10 @@ def test_a_refused_run_leaves_the_last_ones_results(
 def test_what_is_no_recording_is_refused(refuse: Refuse, workshop: Path) -> None:
     (workshop / "empty").mkdir()
     (workshop / "text.mcap").write_text("no recording")
-    assert refuse("run", "navigation", "--no-meshcat", "--play", "empty") == (
+    assert refuse("run", "navigation_open", "--no-meshcat", "--play", "empty") == (
         f"recording {workshop / 'empty'}: no recording in this folder"
     )
-    assert refuse("run", "navigation", "--no-meshcat", "--play", "text.mcap") == (
+    assert refuse("run", "navigation_open", "--no-meshcat", "--play", "text.mcap") == (
         f"recording {workshop / 'text.mcap'}: not a recording (MCAP, rosbag2 or ROS 1 bag)"
     )
 
@@ -209,7 +212,7 @@ def test_a_recording_without_a_needed_topic_is_refused(
             if record.topic != "/robot/imu":
                 message = record.message()
                 writer.write(record.topic, message.__msgtype__, message, record.log_time * 1e-9)
-    line = refuse("run", "navigation", "--no-meshcat", "--play", "poor")
+    line = refuse("run", "navigation_open", "--no-meshcat", "--play", "poor")
     assert line.startswith(f"recording {workshop / 'poor'}: lacks the topic /robot/imu; has ")
     assert "/robot/front_camera/detections" in line
 
@@ -221,7 +224,9 @@ def test_a_camera_file_of_another_size_than_the_recordings_is_refused(
         "width: 320\nheight: 240\nK: [250, 0, 160, 0, 250, 120, 0, 0, 1]\n"
     )
     camera = "robot.sensors.front_camera.calibration=small.yaml"
-    line = refuse("run", "navigation", "--no-meshcat", "--play", navigation.bag, "--set", camera)
+    line = refuse(
+        "run", "navigation_open", "--no-meshcat", "--play", navigation.bag, "--set", camera
+    )
     assert line == (
         f"camera file {workshop / 'small.yaml'} is for pictures of 320x240: "
         "/robot/front_camera/camera_info of the recording is of 640x480"
@@ -234,7 +239,7 @@ def test_a_recording_is_not_overwritten_by_its_own_playback(
     shutil.copytree(navigation.path, workshop / "copy")
     before = (workshop / "copy" / "bag" / "bag_0.mcap").read_bytes()
     for played in ("copy/bag", "copy/bag/bag_0.mcap"):
-        line = refuse("run", "navigation", "--no-meshcat", "--play", played, "--out", "copy")
+        line = refuse("run", "navigation_open", "--no-meshcat", "--play", played, "--out", "copy")
         assert line == "--out copy: holds the recording that is played"
     assert (workshop / "copy" / "bag" / "bag_0.mcap").read_bytes() == before
 
@@ -245,7 +250,9 @@ def test_a_recording_may_have_any_name(
     # YAML would take the first for a number and the second for a mapping.
     for name in ("20240131", "a: b, [c]"):
         shutil.copytree(navigation.bag, workshop / name)
-        result = tagtrail("run", "navigation", "--no-meshcat", "--duration", "0.2", "--play", name)
+        result = tagtrail(
+            "run", "navigation_open", "--no-meshcat", "--duration", "0.2", "--play", name
+        )
         assert result.status == 1, result.err
 
 
@@ -337,14 +344,14 @@ def test_a_drawing_that_cannot_be_made_is_refused(
     refuse: Refuse, workshop: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     projected = ("--set", "sight=projected")
-    assert refuse("diagram", "navigation", *projected, "-o", "n.png") == (
+    assert refuse("diagram", "navigation_open", *projected, "-o", "n.png") == (
         "--out n.png: must end in .svg or .dot"
     )
-    assert refuse("diagram", "navigation", *projected, "-o", "nowhere/n.dot") == (
+    assert refuse("diagram", "navigation_open", *projected, "-o", "nowhere/n.dot") == (
         "--out nowhere/n.dot: No such file or directory"
     )
     monkeypatch.setenv("PATH", str(workshop))
-    assert refuse("diagram", "navigation", *projected, "-o", "n.svg") == (
+    assert refuse("diagram", "navigation_open", *projected, "-o", "n.svg") == (
         "the program 'dot' is missing: install the system package graphviz, or write the source "
         "with -o FILE.dot"
     )

@@ -72,10 +72,10 @@ def text_of(svg: Path) -> list[str]:
 def test_the_svg_shows_every_connected_port_by_name(
     tagtrail: Callable[..., Any], workshop: Path
 ) -> None:
-    result = tagtrail("diagram", "navigation", "-o", "nav.svg")
+    result = tagtrail("diagram", "navigation_open", "-o", "nav.svg")
     assert (result.status, result.err) == (0, "")
     words = text_of(workshop / "nav.svg")
-    mission = load_scenario("navigation").build()
+    mission = load_scenario("navigation_open").build()
     diagrams, connected, blocks = [mission.diagram], set(), set()
     while diagrams:
         diagram = diagrams.pop()
@@ -100,7 +100,7 @@ def test_the_source_of_the_drawing_needs_no_program(
     tagtrail: Callable[..., Any], workshop: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("PATH", str(workshop))
-    result = tagtrail("diagram", "navigation", "--set", "sight=projected", "-o", "nav.dot")
+    result = tagtrail("diagram", "navigation_open", "--set", "sight=projected", "-o", "nav.dot")
     assert (result.status, result.err) == (0, "")
     dot = (workshop / "nav.dot").read_text()
     assert ("localizer", "estimator") in edges(dot)
@@ -113,9 +113,9 @@ def test_the_source_of_the_drawing_needs_no_program(
 def test_without_a_name_the_drawing_is_called_after_the_scenario(
     tagtrail: Callable[..., Any], workshop: Path
 ) -> None:
-    result = tagtrail("diagram", "navigation", "--set", "sight=projected")
-    assert result.out == "navigation.svg\n"
-    assert (workshop / "navigation.svg").is_file()
+    result = tagtrail("diagram", "navigation_open", "--set", "sight=projected")
+    assert result.out == "navigation_open.svg\n"
+    assert (workshop / "navigation_open.svg").is_file()
 
 
 def test_a_drawing_is_written_to_files_of_two_kinds_only(tmp_path: Path) -> None:

@@ -27,7 +27,12 @@ METRICS = {
     "heading_rmse_deg",
     "nees_mean",
     "nees_in_bounds",
+    "nis_mean",
     "path_length_m",
+    "integrated_jerk",
+    "contacts",
+    "min_clearance_m",
+    "mean_clearance_m",
     "time_to_first_fix_s",
     "time_to_goal_s",
 }
@@ -73,7 +78,7 @@ def test_the_robot_reaches_its_waypoints(finished: Any) -> None:
     assert finished.status == 0
     report = finished.report
     assert report["outcome"] == "reached"
-    assert (report["scenario"], report["seed"]) == ("navigation", 3)
+    assert (report["scenario"], report["seed"]) == ("navigation_open", 3)
     metrics = report["metrics"]
     assert metrics["waypoints_reached"] == metrics["waypoints_total"] == 5
     assert metrics["time_to_goal_s"] == report["sim_seconds"] < 60
@@ -133,7 +138,7 @@ def test_the_robot_keeps_its_limits(finished: Any) -> None:
     step = np.diff(t)
     speed = np.hypot(*np.diff(truth[:, :2], axis=0).T) / step
     turn = np.abs(np.angle(np.exp(1j * np.diff(truth[:, 2])))) / step
-    parameters = load_scenario("navigation").controller.arguments["parameters"]
+    parameters = load_scenario("navigation_open").controller.arguments["parameters"]
     assert speed.max() < parameters.max_speed * 1.03
     assert turn.max() < parameters.max_turn_rate * 1.03
     assert speed.max() > parameters.max_speed * 0.97
@@ -251,7 +256,7 @@ def test_noise_of_one_sensor_leaves_that_of_the_others(tmp_path: Path) -> None:
     for density in (5e-4, 1e-3):
         out = tmp_path / str(density)
         scenario = load_scenario(
-            "navigation",
+            "navigation_open",
             {
                 "sight": "projected",
                 "dynamics": "kinematic",
@@ -275,7 +280,7 @@ def test_a_run_that_sees_no_marker_ends_with_a_report(
 ) -> None:
     path = tmp_path / "blind.yaml"
     path.write_text(
-        "extends: navigation\nsight: projected\ndynamics: kinematic\nduration: 3\n"
+        "extends: navigation_open\nsight: projected\ndynamics: kinematic\nduration: 3\n"
         "world: {markers: {family: 4x4_50, size: 0.1, tags: []}}\n"
     )
     result = tagtrail("run", path, "--no-meshcat", "--out", tmp_path / "out")
@@ -307,7 +312,7 @@ def test_an_estimator_that_claims_to_be_certain_is_not_consistent(
     )
     path = tmp_path / "sure.yaml"
     path.write_text(
-        "extends: navigation\nsight: projected\ndynamics: kinematic\nduration: 1\n"
+        "extends: navigation_open\nsight: projected\ndynamics: kinematic\nduration: 1\n"
         "estimator: oracle:Sure\n"
     )
     result = tagtrail("run", path, "--no-meshcat", "--out", tmp_path / "out")

@@ -21,7 +21,7 @@ def play(tagtrail: Callable[..., Any], tmp_path_factory: pytest.TempPathFactory)
     def play(recording: Path, *arguments: str) -> Path:
         out = tmp_path_factory.mktemp("played")
         result = tagtrail(
-            "run", "navigation", "--no-meshcat", "--play", recording, *arguments, "--out", out
+            "run", "navigation_open", "--no-meshcat", "--play", recording, *arguments, "--out", out
         )
         assert result.status in (0, 1), result.err
         assert result.err == ""
@@ -179,6 +179,8 @@ def test_a_run_is_recorded_in_ros_own_messages(navigation: Any, rendered: Any) -
         "/robot/imu": "sensor_msgs/msg/Imu",
         "/robot/drive/sent": "geometry_msgs/msg/Twist",
         "/robot/estimate": "geometry_msgs/msg/PoseWithCovarianceStamped",
+        "/truth/robot/clearance": "std_msgs/msg/Float64",
+        "/truth/robot/contacts": "std_msgs/msg/UInt32",
         "/truth/robot/pose": "geometry_msgs/msg/PoseStamped",
         "/tf": "tf2_msgs/msg/TFMessage",
         "/tf_static": "tf2_msgs/msg/TFMessage",

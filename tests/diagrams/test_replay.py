@@ -176,7 +176,7 @@ def test_robot_markers_waypoints_and_path_are_drawn(
 ) -> None:
     late = screenshots[LATE]
     assert late.shape == (HEIGHT, WIDTH, 3)
-    scenario = load_scenario("navigation")
+    scenario = load_scenario("navigation_open")
     # Markers on the far wall: black cells and white margins close together.
     far = [m for m in scenario.world.marker_map() if abs(m.X_WM.translation()[1] - 2) < 0.1]
     assert len(far) >= 4

@@ -28,7 +28,7 @@ def refusal(path: Path | str, overrides: Any = ()) -> str:
 
 
 def refused_override(*overrides: str) -> str:
-    return refusal("navigation", overrides)
+    return refusal("navigation_open", overrides)
 
 
 # Values
@@ -116,7 +116,7 @@ def test_files_extend_files(write_scenario: Writer, tmp_path: Path) -> None:
     assert scenario.estimator.arguments["parameters"].gate == 5.0
     assert scenario.estimator.arguments["rate"] == 50.0
     assert scenario.name == "top"
-    bundled = load_scenario("navigation")
+    bundled = load_scenario("navigation_open")
     assert scenario.waypoints == bundled.waypoints
     assert scenario.mission == "navigation"
 
@@ -171,7 +171,7 @@ world:
     top_left, top_right = marker.corners()[:2]
     assert top_left == pytest.approx([2.0, 1.1, 0.4])
     assert top_right == pytest.approx([2.0, 0.9, 0.4])
-    assert load_scenario("navigation").world.markers == "navigation.json"
+    assert load_scenario("navigation_open").world.markers == "navigation.json"
 
 
 # --set
@@ -179,7 +179,7 @@ world:
 
 def test_set_reaches_into_blocks_written_as_words_and_into_lists() -> None:
     scenario = load_scenario(
-        "navigation",
+        "navigation_open",
         [
             "estimator.gate=12",
             "robot.body.wheel_radius=0.04",
@@ -193,15 +193,15 @@ def test_set_reaches_into_blocks_written_as_words_and_into_lists() -> None:
     assert scenario.estimator.arguments["parameters"].gate == 12.0
     assert scenario.robot.body.arguments["parameters"].wheel_radius == 0.04
     assert scenario.waypoints[:2] == [[-1.7, 0.9], [0.0, 0.9]]
-    assert scenario.waypoints[2:] == load_scenario("navigation").waypoints[2:]
+    assert scenario.waypoints[2:] == load_scenario("navigation_open").waypoints[2:]
     assert [wall.height for wall in scenario.world.arena.walls] == [0.6] * 4 + [0.5, 0.6]
     imu = scenario.robot.sensors["imu"].arguments["parameters"]
     assert (imu.gyro_bias, imu.gyro_noise_density) == ([0.0, 0.0, 1e-3], 5e-4)
 
 
 def test_later_overrides_win_and_may_come_as_a_mapping() -> None:
-    assert load_scenario("navigation", ["seed=1", "seed=2"]).seed == 2
-    scenario = load_scenario("navigation", {"seed": 5, "estimator": {"type": "kf", "gate": 3}})
+    assert load_scenario("navigation_open", ["seed=1", "seed=2"]).seed == 2
+    scenario = load_scenario("navigation_open", {"seed": 5, "estimator": {"type": "kf", "gate": 3}})
     assert (scenario.seed, scenario.estimator.arguments["parameters"].gate) == (5, 3.0)
 
 
@@ -226,14 +226,14 @@ def test_a_bundled_name_is_not_hidden_by_a_file_in_the_current_folder(
     write_scenario: Writer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    write_scenario("seed: 77\n", "navigation")
+    write_scenario("seed: 77\n", "navigation_open")
     write_scenario("", "vga.yaml", extends=None)
     write_scenario("", "navigation.json", extends=None)
-    scenario = load_scenario("navigation")
+    scenario = load_scenario("navigation_open")
     assert scenario.seed == 0
     assert scenario.world.markers == "navigation.json"
     assert scenario.robot.sensors["front_camera"].arguments["calibration"] == "vga.yaml"
-    assert load_scenario("./navigation").seed == 77
+    assert load_scenario("./navigation_open").seed == 77
 
 
 @pytest.mark.parametrize("name", sorted(bundled_scenarios()))
@@ -281,7 +281,7 @@ robot: {sensors: {front_camera: {calibration: my_camera.yaml, projector: {max_ra
 
 
 def test_a_saved_scenario_shows_every_default(tmp_path: Path) -> None:
-    save_scenario(load_scenario("navigation"), tmp_path / "saved.yaml")
+    save_scenario(load_scenario("navigation_open"), tmp_path / "saved.yaml")
     text = (tmp_path / "saved.yaml").read_text()
     for line in ("  gate: 16.27", "  k_a: 2.0", "    wheel_radius: 0.0325", "  patience: 0.5"):
         assert f"\n{line}\n" in text

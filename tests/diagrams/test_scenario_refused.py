@@ -84,7 +84,7 @@ def refusal(path: Path | str, overrides: Any = ()) -> str:
     ],
 )  # fmt: skip
 def test_an_override_is_refused_by_its_key(override: str, message: str) -> None:
-    said = refusal("navigation", [override])
+    said = refusal("navigation_open", [override])
     if message.endswith(("known: ", "in ")):
         assert said.startswith(message)
     else:
@@ -101,7 +101,7 @@ def test_an_override_is_refused_by_its_key(override: str, message: str) -> None:
 )
 def test_what_a_driver_refuses_stands_where_it_was_written(override: str, said: str) -> None:
     key = "robot.sensors.front_camera"
-    scenario = load_scenario("navigation", ["sight=projected", f"{key}.{override}"])
+    scenario = load_scenario("navigation_open", ["sight=projected", f"{key}.{override}"])
     with pytest.raises(ScenarioError) as caught:
         scenario.build()
     name = override.partition("=")[0]
@@ -110,7 +110,7 @@ def test_what_a_driver_refuses_stands_where_it_was_written(override: str, said: 
 
 @pytest.mark.parametrize("name", ["drive", "estimate", "Camera", "front camera", "x/y", "é", "1st"])
 def test_a_device_needs_a_name_that_ros_and_the_station_can_use(name: str) -> None:
-    said = refusal("navigation", {f"robot.sensors.{name}": {"type": "imu"}})
+    said = refusal("navigation_open", {f"robot.sensors.{name}": {"type": "imu"}})
     assert f"robot.sensors is {name!r}: must be a name in lower case" in said
 
 

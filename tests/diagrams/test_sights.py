@@ -24,7 +24,7 @@ def random_poses() -> np.ndarray:
 
 def seen_from(poses: np.ndarray, *overrides: str) -> list[Detections]:
     """What the front camera of the bundled robot finds from each pose."""
-    mission = load_scenario("navigation", overrides).build()
+    mission = load_scenario("navigation_open", overrides).build()
     station = mission.station
     body = station.plant.GetBodyByName("base_link")
     found = []
@@ -66,7 +66,7 @@ def corners() -> dict[str, dict[tuple[int, int], np.ndarray]]:
 def test_the_corner_noise_is_as_the_scenario_has_it(
     corners: dict[str, dict[tuple[int, int], np.ndarray]], sight: str
 ) -> None:
-    projector = load_scenario("navigation").robot.sensors["front_camera"].build().projector
+    projector = load_scenario("navigation_open").robot.sensors["front_camera"].build().projector
     both = sorted(corners[sight].keys() & corners["exact"].keys())
     exact = np.array([corners["exact"][key] for key in both])
     error = np.array([corners[sight][key] for key in both]) - exact

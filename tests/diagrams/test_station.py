@@ -15,7 +15,7 @@ WORLD = ("plant", "scene_graph", "robot.state", "robot.twin", "robot.servos")
 
 
 def station(*overrides: str) -> Station:
-    return load_scenario("navigation", overrides).build().station
+    return load_scenario("navigation_open", overrides).build().station
 
 
 def ports(system: System) -> set[Port]:
@@ -57,6 +57,8 @@ def test_the_ports_are_those_that_the_design_names(simulated: dict[str, set[Port
         ("out robot.front_camera.health", abstract, 0, "Health"),
         ("out robot.imu.sample", vector, 6, ""),
         ("out scene.query_object", abstract, 0, "QueryObject"),
+        ("out truth.robot.clearance", vector, 1, ""),
+        ("out truth.robot.contacts", vector, 1, ""),
         ("out truth.robot.pose", vector, 3, ""),
     }
 
@@ -126,7 +128,7 @@ def feeds(diagram: Diagram) -> dict[str, set[str]]:
 @pytest.mark.parametrize("sight", ["rendered", "projected"])
 def test_the_robot_knows_the_world_by_its_sensors_only(sight: str, dynamics: str) -> None:
     overrides = [f"sight={sight}", f"dynamics={dynamics}"]
-    reads = feeds(load_scenario("navigation", overrides).build().diagram)
+    reads = feeds(load_scenario("navigation_open", overrides).build().diagram)
     robot = {"robot.drive", "localizer", "estimator", "sequencer", "controller", "search"}
     known: set[str] = set()
     front = set(robot)
@@ -146,7 +148,7 @@ def test_the_robot_knows_the_world_by_its_sensors_only(sight: str, dynamics: str
 
 
 def test_only_those_who_watch_read_the_truth(tmp_path: Any) -> None:
-    scenario = load_scenario("navigation", ["sight=projected"])
+    scenario = load_scenario("navigation_open", ["sight=projected"])
     mission = scenario.build(out=tmp_path)
     mission.recorder.close()
     readers = {
@@ -155,4 +157,5 @@ def test_only_those_who_watch_read_the_truth(tmp_path: Any) -> None:
         if origin is mission.station
         and origin.get_output_port(output).get_name().startswith("truth.")
     }
-    assert readers == {"log of truth.robot.pose", "recorder"}
+    watched = {f"log of truth.robot.{kind}" for kind in ("pose", "clearance", "contacts")}
+    assert readers == {*watched, "recorder"}

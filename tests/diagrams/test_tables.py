@@ -73,7 +73,9 @@ def scene(tmp_path: Path) -> Callable[[str], Path]:
 
     def write(controller: str) -> Path:
         path = tmp_path / "scene.yaml"
-        path.write_text(f"extends: navigation\nsight: projected\ncontroller:\n  {controller}\n")
+        path.write_text(
+            f"extends: navigation_open\nsight: projected\ncontroller:\n  {controller}\n"
+        )
         return path
 
     return write
@@ -203,7 +205,7 @@ def test_a_module_of_the_same_name_elsewhere_is_not_taken_for_it(tmp_path: Path)
         (folder / "lib" / "twins.py").write_text(CONTROLLER)
         paths.append(folder / "scene.yaml")
         paths[-1].write_text(
-            f"extends: navigation\ncontroller: {{type: lib/twins:Carrot, speed: {speed}}}\n"
+            f"extends: navigation_open\ncontroller: {{type: lib/twins:Carrot, speed: {speed}}}\n"
         )
     load_scenario(str(paths[0]))
     with pytest.raises(ScenarioError, match="twins was imported already, from another place"):
@@ -216,7 +218,7 @@ def test_an_override_names_a_module_in_the_current_folder(
     (tmp_path / "own_controllers.py").write_text(CONTROLLER)
     monkeypatch.chdir(tmp_path)
     block = "controller={type: own_controllers:Carrot, speed: 0.25}"
-    assert load_scenario("navigation", [block]).controller.arguments["speed"] == 0.25
+    assert load_scenario("navigation_open", [block]).controller.arguments["speed"] == 0.25
 
 
 # Tables alone

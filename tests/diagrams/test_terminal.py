@@ -46,18 +46,20 @@ def test_the_installed_command_lists_the_scenarios_a_line_each(tmp_path: Path) -
     names = [line.split()[0] for line in finished.stdout.splitlines()]
     bundled = sorted(path.stem for path in (ROOT / "diagrams" / "scenarios").glob("*.yaml"))
     assert names == bundled
-    assert "navigation" in names
+    assert "navigation_open" in names
 
 
 def test_a_failed_run_ends_with_1_and_bad_input_with_2(tmp_path: Path) -> None:
-    failed = terminal("run", "navigation", *SHORT, cwd=tmp_path)
+    failed = terminal("run", "navigation_open", *SHORT, cwd=tmp_path)
     assert failed.returncode == 1, failed.stderr
     assert failed.stderr == ""
-    assert "navigation: timeout" in failed.stdout
+    assert "navigation_open: timeout" in failed.stdout
     # Without --out the results lie where the last line says.
-    report = json.loads((tmp_path / "out" / "navigation" / "report.json").read_text())
+    report = json.loads((tmp_path / "out" / "navigation_open" / "report.json").read_text())
     assert report["outcome"] == "timeout"
-    refused = error_line(terminal("run", "navigation", "--set", "sihgt=projected", cwd=tmp_path))
+    refused = error_line(
+        terminal("run", "navigation_open", "--set", "sihgt=projected", cwd=tmp_path)
+    )
     assert refused == "tagtrail: --set sihgt: sihgt: unknown key; did you mean 'sight'?"
 
 
@@ -90,11 +92,11 @@ def in_a_terminal(*arguments: str, cwd: Path) -> tuple[int, str]:
 def test_in_a_terminal_a_bar_shows_how_far_it_is(
     picture: Callable[[Path], Path], tmp_path: Path
 ) -> None:
-    status, seen = in_a_terminal("run", "navigation", *SHORT[:-1], "3", cwd=tmp_path)
+    status, seen = in_a_terminal("run", "navigation_open", *SHORT[:-1], "3", cwd=tmp_path)
     assert status == 1, seen
     assert "Traceback" not in seen
     assert " / 3.0" in seen
-    assert "navigation: timeout" in seen
+    assert "navigation_open: timeout" in seen
     picture(tmp_path / "a.png")
     status, seen = in_a_terminal("detect", "a.png", "--family", "4x4_50", cwd=tmp_path)
     assert status == 0, seen
@@ -103,7 +105,7 @@ def test_in_a_terminal_a_bar_shows_how_far_it_is(
 
 def test_an_interrupted_run_says_so_and_keeps_its_recording(tmp_path: Path) -> None:
     process = subprocess.Popen(
-        [sys.executable, "-m", "tagtrail", "run", "navigation", *SHORT[:-2], "--realtime", "1",
+        [sys.executable, "-m", "tagtrail", "run", "navigation_open", *SHORT[:-2], "--realtime", "1",
          "--out", "out"],
         cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, stderr=subprocess.PIPE, text=True,
     )  # fmt: skip
