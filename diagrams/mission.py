@@ -249,6 +249,16 @@ class Mission:
             context: of the diagram.
         """
 
+    def unfinished(self, context: Context, word: str) -> str:
+        """Returns the word for a run whose time was up; `word` unless the mission knows better.
+
+        Args:
+            context: of the diagram.
+            word: `timeout`, or `played` at the end of a recording.
+        """
+        del context
+        return word
+
     @abstractmethod
     def succeeded(self, outcome: str) -> bool:
         """Whether that outcome means that the mission was fulfilled."""

@@ -219,6 +219,10 @@ class NavigationMission(Mission):
             return "contact" if self._touched(context) else "blocked"
         return None
 
+    def unfinished(self, context: Context, word: str) -> str:
+        """Returns `contact` for a run in which the robot touched something."""
+        return "contact" if self._touched(context) else word
+
     def _touched(self, context: Context) -> bool:
         name = f"truth.{ROBOT}.contacts"
         return self._wiring.has_output(name) and self._wiring.value(name, context)[0] > 0

@@ -136,7 +136,8 @@ def _advance(
             progress(context.get_time(), end)
     wall = time.perf_counter() - started
     if outcome is None:
-        outcome = "timeout" if end == scenario.duration else "played"
+        word = "timeout" if end == scenario.duration else "played"
+        outcome = mission.unfinished(context, word)
     return outcome, context, wall
 
 

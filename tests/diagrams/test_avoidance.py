@@ -87,3 +87,14 @@ def test_blocks_that_do_not_fit_are_refused(overrides: list[Any], message: str) 
     with pytest.raises(ScenarioError) as refusal:
         load_scenario("navigation", overrides)
     assert message in str(refusal.value)
+
+
+def test_a_touch_is_told_even_when_the_time_runs_out() -> None:
+    # A cylinder drives over the robot, which stands while its gyro is calibrated.
+    ram = "{radius: 0.1, height: 0.5, path: [[-1.2, -1.4], [-1.9, -1.4]], speed: 0.6}"
+    report = run(
+        "navigation", "dynamics=kinematic", "duration=1.5", f"world.arena.moving=[{ram}]"
+    ).report
+    assert report["outcome"] == "contact"
+    assert report["metrics"]["contacts"] == 1
+    assert report["metrics"]["min_clearance_m"] < 0
