@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,23 +24,23 @@ def require_point(name: str, value: Any) -> None:
     require(len(value) == 2 and bool(np.isfinite(value).all()), name, value, "[x, y] in metres")
 
 
-class _UprightBox:
+class _UprightBox(ABC):
     """What a wall and a box have in common; they say `centre`, `heading` and `dimensions`."""
 
     @property
+    @abstractmethod
     def centre(self) -> Array:
         """Returns the middle of the ground that it covers, (2,) m."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def heading(self) -> float:
         """Returns the direction of its length, rad."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def dimensions(self) -> list[float]:
         """Returns length, width and height, m."""
-        raise NotImplementedError
 
     def pose(self) -> RigidTransform:
         """Returns the pose of its shape: origin at its centre, x along its length."""
