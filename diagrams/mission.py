@@ -70,6 +70,7 @@ class Wiring:
         self._signals = list(self.station.signals)
         self._sources: dict[str, str] = {}  # of signals that are not the station's
         self._logs: dict[str, VectorLogSink] = {}
+        self._watched: dict[str, OutputPort] = {}
         if meshcat is not None:
             parameters = MeshcatVisualizerParams(
                 publish_period=1 / FRAME_RATE, role=Role.kIllustration, prefix="scene"
@@ -115,7 +116,9 @@ class Wiring:
             name: as `output` takes it.
             context: of the whole diagram.
         """
-        port = self.output(name)
+        if name not in self._watched:  # to look a port up by its name takes a millisecond
+            self._watched[name] = self.output(name)
+        port = self._watched[name]
         return port.Eval(port.get_system().GetMyContextFromRoot(context))
 
     def connect(self, source: str, target: str) -> None:

@@ -7,7 +7,6 @@ of small objects that are moved; what is not needed waits below the ground.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,14 +15,14 @@ from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, InputPort, LeafSystem
 
-from systems.angles import spatial_pose
+from systems.angles import spatial_pose, wrap
 from systems.messages import AvoiderState, OccupancyGrid, Path, Scan
-from systems.scans import scan_points
+from systems.scans import hits, scan_points
 
 Array = NDArray[np.float64]
 
 _ROOT = "view"
-_POINTS = 120  # of a scan
+_POINTS = 90  # of a scan
 _SCAN_HEIGHT = 0.13  # m
 _DOTS, _DOT_STEP = 80, 0.12  # of the planned path, and m between two
 _RING = 0.30  # m, radius of the circle of sectors
@@ -34,25 +33,63 @@ _AWAY = RigidTransform([0.0, 0.0, -10.0])
 
 
 class _Pool:
-    """A fixed number of equal objects of which some are to be seen."""
+    """Equal objects, each shown or not, each with a place; only what changes is sent.
 
-    def __init__(self, meshcat: Meshcat, name: str, count: int, shape: Shape, colour: Rgba) -> None:
+    The replay lets an object glide from one place to the next, however long it stood. With `jumps`
+    it is held where it was up to the frame before it moves.
+    """
+
+    def __init__(
+        self,
+        meshcat: Meshcat,
+        name: str,
+        count: int,
+        shape: Shape,
+        colour: Rgba,
+        *,
+        frame: float,
+        jumps: bool = False,
+    ) -> None:
         self._meshcat = meshcat
+        self._jumps = jumps
+        self._frame = frame  # s between two pictures
         self._names = [f"{_ROOT}/{name}/{k}" for k in range(count)]
-        self._shown = 0
+        self._places = np.full((count, 4), np.nan)  # x, y, z (m), yaw (rad)
+        self._poses = [_AWAY] * count
+        self._set_at = np.zeros(count)
+        self._visible = np.zeros(count, bool)
         for path in self._names:
             meshcat.SetObject(path, shape, colour)
-            meshcat.SetTransform(path, _AWAY)
+            meshcat.SetProperty(path, "visible", False, 0.0)
 
-    def show(self, poses: Iterable[RigidTransform], t: float) -> None:
-        """Puts the first objects at `poses` (no more than there are) and the others away."""
-        shown = 0
-        for name, pose in zip(self._names, poses, strict=False):
-            self._meshcat.SetTransform(name, pose, t)
-            shown += 1
-        for name in self._names[shown : self._shown]:
-            self._meshcat.SetTransform(name, _AWAY, t)
-        self._shown = shown
+    def __len__(self) -> int:
+        return len(self._names)
+
+    def show(self, places: Array, t: float) -> None:
+        """Puts each object at its place and hides those that have none.
+
+        Args:
+            places: (n, 4) [x (m), y (m), z (m), yaw (rad)] of the first n objects, in the frame
+                of the pool; NaN for one that is not to be seen.
+            t: time of the simulation, s.
+        """
+        t = (round(t / self._frame) + 0.25) * self._frame  # frames are counted down from t
+        places = places[: len(self)]
+        wanted = np.zeros(len(self), bool)
+        wanted[: len(places)] = np.isfinite(places[:, 0])
+        moved = np.nonzero((self._places[: len(places)] != places).any(axis=1))[0]
+        for k in moved[wanted[moved]]:
+            *xyz, yaw = places[k]
+            if self._jumps and self._visible[k] and t - self._set_at[k] > 1.5 * self._frame:
+                self._meshcat.SetTransform(self._names[k], self._poses[k], t - self._frame)
+            pose = RigidTransform(RollPitchYaw(0.0, 0.0, yaw), xyz)
+            self._meshcat.SetTransform(self._names[k], pose, t)
+            self._places[k], self._poses[k], self._set_at[k] = places[k], pose, t
+        for k in np.nonzero(wanted != self._visible)[0]:
+            if not wanted[k]:  # lest it glides to where it is seen next
+                self._meshcat.SetTransform(self._names[k], self._poses[k], t)
+            self._meshcat.SetProperty(self._names[k], "visible", bool(wanted[k]), t)
+        self._visible = wanted
 
 
 def along(points: Array, step: float) -> Array:
@@ -117,10 +154,10 @@ class SurroundingsViewer(LeafSystem):
             name: self.DeclareAbstractInputPort(name, AbstractValue.Make(model))
             for name, model in inputs.items()
         }
-        self._scan = _Pool(meshcat, "scan", _POINTS, Sphere(0.012), Rgba(0.05, 0.05, 0.05, 1.0))
-        self._path = _Pool(
-            meshcat, "planned path", _DOTS, Cylinder(0.018, 0.004), Rgba(0.1, 0.3, 0.9, 1.0)
-        )
+        self._frame = 1.0 / rate
+        self._scan = self._pool("scan", _POINTS, Sphere(0.012), Rgba(0.05, 0.05, 0.05, 1.0))
+        disc = Cylinder(0.018, 0.004)
+        self._path = self._pool("planned path", _DOTS, disc, Rgba(0.1, 0.3, 0.9, 1.0), jumps=True)
         self._sectors: _Pool | None = None
         # What the browser holds, not the diagram: the stamps of what was drawn, the tiles.
         self._drawn = dict.fromkeys(inputs, math.nan)
@@ -147,6 +184,11 @@ class SurroundingsViewer(LeafSystem):
     def grid_input_port(self) -> InputPort:
         """Returns the port of the occupancy grid."""
         return self._inputs["grid"]
+
+    def _pool(
+        self, name: str, count: int, shape: Shape, colour: Rgba, jumps: bool = False
+    ) -> _Pool:
+        return _Pool(self._meshcat, name, count, shape, colour, frame=self._frame, jumps=jumps)
 
     def _draw_pointer(self) -> None:
         name = f"{_ROOT}/direction/pointer"
@@ -178,45 +220,42 @@ class SurroundingsViewer(LeafSystem):
             self._draw_state(self._inputs["state"].Eval(context), pose, t)
         if isinstance(path := self._new("path", context), Path):
             dots = along(path.points, _DOT_STEP)
-            self._path.show((RigidTransform([*dot, 0.006]) for dot in dots), t)
+            self._path.show(np.c_[dots, np.tile([0.006, 0.0], (len(dots), 1))], t)
         if isinstance(grid := self._new("grid", context, _GRID_PERIOD), OccupancyGrid):
             self._draw_grid(grid, t)
 
     def _draw_scan(self, scan: Scan, pose: Array, t: float) -> None:
-        points = scan_points(scan, self._lidar_pose)
-        points = points[:: max(1, math.ceil(len(points) / _POINTS))]
-        X_WB = spatial_pose(pose)
-        places = (X_WB.multiply([x, y, _SCAN_HEIGHT]) for x, y in points)
-        self._scan.show(map(RigidTransform, places), t)
+        every = max(1, math.ceil(len(scan.ranges) / _POINTS))
+        places = np.full((len(scan.ranges), 4), np.nan)
+        seen = hits(scan)
+        x, y = scan_points(scan, self._lidar_pose).T
+        cos, sin = math.cos(pose[2]), math.sin(pose[2])
+        places[seen, 0] = pose[0] + cos * x - sin * y
+        places[seen, 1] = pose[1] + sin * x + cos * y
+        places[:, 2:] = _SCAN_HEIGHT, 0.0
+        self._scan.show(places[::every], t)
 
     def _draw_state(self, state: AvoiderState, pose: Array, t: float) -> None:
         visible = math.isfinite(state.direction)
         pointer = spatial_pose(np.array([*pose[:2], state.direction])) if visible else _AWAY
         self._meshcat.SetTransform(f"{_ROOT}/direction", pointer, t)
-        if self._sectors is None and len(state.angles) > 0:
-            width = 2 * math.pi * _RING / len(state.angles)
-            self._sectors = _Pool(
-                self._meshcat,
-                "sectors",
-                len(state.angles),
-                Box(0.02, 0.8 * width, 0.01),
-                Rgba(0.85, 0.15, 0.1, 0.9),
-            )
-        if self._sectors is not None:
-            self._sectors.show(
-                (
-                    RigidTransform(
-                        RollPitchYaw(0.0, 0.0, angle),
-                        [
-                            pose[0] + _RING * math.cos(angle),
-                            pose[1] + _RING * math.sin(angle),
-                            _SCAN_HEIGHT,
-                        ],
-                    )
-                    for angle in state.angles[~state.free]
-                ),
-                t,
-            )
+        angles = state.angles
+        if len(angles) == 0:
+            return
+        if self._sectors is None:
+            width = 2 * math.pi * _RING / len(angles)
+            block = Box(0.02, 0.8 * width, 0.01)
+            colour = Rgba(0.85, 0.15, 0.1, 0.9)
+            self._sectors = self._pool("sectors", len(angles), block, colour)
+        # The sectors turn with the robot: the ring is moved, not each of its blocks.
+        ring = spatial_pose(np.array([*pose[:2], angles[0]]), _SCAN_HEIGHT)
+        self._meshcat.SetTransform(f"{_ROOT}/sectors", ring, t)
+        turned = np.round(wrap(angles - angles[0]), 6)
+        places = np.stack(
+            [_RING * np.cos(turned), _RING * np.sin(turned), 0 * turned, turned], axis=1
+        )
+        places[state.free] = np.nan
+        self._sectors.show(places, t)
 
     def _draw_grid(self, grid: OccupancyGrid, t: float) -> None:
         occupied = {(int(i), int(j)) for i, j in occupied_cells(grid, _CELL)}

@@ -43,6 +43,12 @@ def scan_fault(scan: Scan, now: float, max_age: float) -> str | None:
     return "stale_scan" if not 0 <= now - scan.stamp + 1e-6 <= max_age else None
 
 
+def hits(scan: Scan) -> NDArray[np.intp]:
+    """Returns the indices of the rays that measured a distance within the scan's range."""
+    hit = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
+    return np.flatnonzero(hit & np.isfinite(scan.ranges))
+
+
 def scan_points(
     scan: Scan,
     lidar_pose: Array,
@@ -62,9 +68,7 @@ def scan_points(
             ray; moves each point to where it is seen from `now`. None leaves out the motion.
         now: the moment, s; None is that of the last ray.
     """
-    hit = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
-    hit &= np.isfinite(scan.ranges)
-    index = np.flatnonzero(hit)
+    index = hits(scan)
     ranges = scan.ranges[index]
     angles = scan.angle_min + scan.angle_increment * index + lidar_pose[2]
     points = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=-1) + lidar_pose[:2]
