@@ -23,7 +23,8 @@ from pydrake.systems.primitives import LogVectorOutput, VectorLogSink
 from diagrams.channels import Signal
 from diagrams.scenario import Scenario
 from diagrams.schema import ScenarioError
-from diagrams.station import RobotParameters, Station, WorldParameters
+from diagrams.station import RobotParameters, Station
+from diagrams.world import WorldParameters
 from systems.io.bag import BagReader, BagWriter
 from systems.io.recorder import Recorder
 from systems.validation import nearest

@@ -28,10 +28,11 @@ from diagrams.metrics import (
 from diagrams.mission import FRAME_RATE, Mission, Wiring
 from diagrams.plots import plot_navigation
 from diagrams.scenario import Scenario
-from diagrams.station import RobotParameters, WorldParameters
+from diagrams.station import RobotParameters
 from diagrams.tables import Choice, Table
 from diagrams.trajectories import write_tum
 from diagrams.viewer import EstimateViewer
+from diagrams.world import WorldParameters
 from plants.arena import check_free
 from systems.angles import spatial_pose
 from systems.controllers.collision_monitor import CollisionMonitorParameters

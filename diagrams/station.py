@@ -17,7 +17,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydrake.geometry import MakeRenderEngineVtk, RenderEngineVtkParams, SceneGraph
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform
 from pydrake.multibody.plant import (
     AddMultibodyPlant,
     MultibodyPlant,
@@ -26,15 +26,16 @@ from pydrake.multibody.plant import (
 from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, OutputPort, System
 
 from diagrams.channels import Signal
-from diagrams.schema import File, ScenarioError, file_path
+from diagrams.schema import ScenarioError
 from diagrams.surroundings import add_clearance, add_motion, show_twins
 from diagrams.tables import Choice, Table
-from plants.arena import ArenaParameters, add_arena
+from diagrams.world import WorldParameters
+from plants.arena import add_arena
 from plants.lighting import daylight
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
-from systems.markers.family import family
-from systems.markers.layout import Marker, MarkerMap, load_map
-from systems.validation import require, require_non_negative, require_positive
+from systems.markers.layout import MarkerMap
+from systems.sensors.faults import Fault, FaultInjector
+from systems.validation import nearest, require
 
 if typing.TYPE_CHECKING:
     from diagrams.drivers.body import DifferentialDriveBody
@@ -72,88 +73,6 @@ RENDERER = "vtk"
 
 
 @dataclass
-class TagPlacement:
-    """One marker of a scenario's own list.
-
-    Attributes:
-        id: in the family.
-        position: [x, y, z] of its centre, m.
-        facing_deg: direction that the printed face looks to, in the ground plane; 0 is along x.
-        size: side of the black square, m; 0 takes the list's.
-    """
-
-    id: int
-    position: list[float]
-    facing_deg: float
-    size: float = 0.0
-
-    def __post_init__(self) -> None:
-        require(
-            len(self.position) == 3 and bool(np.isfinite(self.position).all()),
-            "position",
-            self.position,
-            "[x, y, z] in metres",
-        )
-        require(math.isfinite(self.facing_deg), "facing_deg", self.facing_deg, "finite")
-        require_non_negative(size=self.size)
-
-
-@dataclass
-class TagList:
-    """Upright markers written in the scenario itself, instead of a marker map's file.
-
-    Attributes:
-        family: of all markers.
-        size: side of the black square, m.
-        tags: where they are.
-    """
-
-    family: str
-    size: float
-    tags: list[TagPlacement]
-
-    def __post_init__(self) -> None:
-        require_positive(size=self.size)
-        self.to_map()
-
-    def to_map(self) -> MarkerMap:
-        """Returns the marker map.
-
-        Raises:
-            ValueError: unknown family, an id twice or outside the family.
-        """
-        kind = family(self.family)
-        markers: dict[int, Marker] = {}
-        for tag in self.tags:
-            kind.check_id(tag.id)
-            require(tag.id not in markers, "id", tag.id, "given once")
-            R = RollPitchYaw(0.0, 0.0, math.radians(tag.facing_deg))
-            markers[tag.id] = Marker(tag.id, RigidTransform(R, tag.position), tag.size or self.size)
-        return MarkerMap(kind, self.size, markers)
-
-
-@dataclass
-class WorldParameters:
-    """What stands around the robots.
-
-    In a scenario it may come from the seed instead: see `diagrams.random_world`.
-
-    Attributes:
-        markers: a marker map's file (bundled, or beside the scenario), or the markers themselves.
-        arena: ground and obstacles.
-    """
-
-    markers: Annotated[str, File("maps")] | TagList
-    arena: ArenaParameters = field(default_factory=ArenaParameters)
-
-    def marker_map(self) -> MarkerMap:
-        """Returns the marker map."""
-        if isinstance(self.markers, TagList):
-            return self.markers.to_map()
-        return load_map(file_path(self.markers, "maps"))
-
-
-@dataclass
 class Start:
     """Where a robot starts.
 
@@ -185,12 +104,14 @@ class RobotParameters:
         start: pose at the start.
         drive: driver of the wheels.
         sensors: drivers by device name.
+        faults: what goes wrong with the sensors on purpose.
     """
 
     body: Annotated[Choice, BODIES]
     drive: Annotated[Choice, DRIVES]
     start: Start = field(default_factory=Start)
     sensors: dict[str, Annotated[Choice, SENSORS]] = field(default_factory=dict)
+    faults: list[Fault] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         for name in self.sensors:
@@ -239,12 +160,14 @@ class StationBuilder:
 
     Attributes:
         world: what stands around the robots.
-        marker_map: the markers of the world.
+        marker_map: the markers as the robots believe them to be.
+        true_markers: the markers as they are.
         seed: of all noise.
         sight: `rendered` or `projected`.
         time_step: of the multibody plant, s.
         dynamics: `multibody` or `kinematic`.
         player: the recording that is played back, or None when the station is simulated.
+        faults: by the name of the port, what is still to go wrong with it.
         plant: the model of world and robots, finalized when sensors are added.
         scene_graph: its geometry.
         signals: the ports that go into a recording.
@@ -255,11 +178,13 @@ class StationBuilder:
 
     world: WorldParameters
     marker_map: MarkerMap
+    true_markers: MarkerMap
     seed: int = 0
     sight: str = "rendered"
     time_step: float = 0.005
     dynamics: str = "multibody"
     player: BagReader | None = None
+    faults: dict[str, list[Fault]] = field(default_factory=dict)
     builder: DiagramBuilder = field(default_factory=DiagramBuilder)
     signals: list[Signal] = field(default_factory=list)
     static_messages: dict[str, tuple[str, Any]] = field(default_factory=dict)
@@ -283,7 +208,7 @@ class StationBuilder:
             self.plant.RegisterAsSourceForSceneGraph(self.scene_graph)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
-        add_arena(self.plant, self.world.arena, self.marker_map)
+        add_arena(self.plant, self.world.arena, self.true_markers)
 
     @property
     def simulated(self) -> bool:
@@ -305,9 +230,35 @@ class StationBuilder:
 
     def export_output(self, port: OutputPort, name: str, signal: Signal | None = None) -> None:
         """Makes a port of a block an output port of the station, recorded if it is a signal."""
-        self.builder.ExportOutput(port, name)
         if signal is not None:
+            port = self.spoiled(port, signal)
             self.signals.append(signal)
+        self.builder.ExportOutput(port, name)
+
+    def spoiled(self, port: OutputPort, signal: Signal) -> OutputPort:
+        """Returns the port with the faults that the scenario has for it, or the port itself.
+
+        For what looks at a signal before it is exported; to export it then adds them no more.
+
+        Raises:
+            ScenarioError: a kind of fault that such a signal cannot have.
+        """
+        faults = self.faults.pop(signal.port, [])
+        if not faults:
+            return port
+        try:
+            injector = FaultInjector(
+                model=signal.model,
+                faults=faults,
+                rate=signal.rate,
+                seed=self.seed,
+                name=f"{signal.port}.faults",
+            )
+        except ValueError as error:
+            raise ScenarioError(f"faults of {signal.port}: {error}") from error
+        self.add(injector, f"{signal.port}.faults")
+        self.connect(port, injector.input_port())
+        return injector.output_port()
 
     def play(self, signal: Signal, optional: bool = False) -> Any:
         """Adds what plays a signal from the recording, and returns its output port.
@@ -352,7 +303,7 @@ class Station(Diagram):
     Attributes:
         signals: the ports that go into a recording.
         static_messages: topic to (message type, message), written once into a recording.
-        marker_map: the markers of the world.
+        marker_map: the markers as the robots believe them to be.
         plant: the model of world and robots.
         scene_graph: its geometry.
         robots: by name.
@@ -388,11 +339,13 @@ class Station(Diagram):
         station = StationBuilder(
             world=world,
             marker_map=world.marker_map(),
+            true_markers=world.true_markers(),
             seed=seed,
             sight=sight,
             time_step=time_step,
             dynamics=dynamics if player is None else "kinematic",
             player=player,
+            faults=_faults_by_port(robots),
         )
         bodies = {
             name: Robot(
@@ -414,6 +367,9 @@ class Station(Diagram):
             for device, sensor in robots[name].sensors.items():
                 sensor.build().add(station, robot, device)
             add_clearance(station, robot, moving)
+        for port in station.faults:
+            known = [signal.port for signal in station.signals]
+            raise ScenarioError(f"faults: there is no signal {port}; {nearest(port, known)}")
         if station.dynamics == "kinematic" and station.plant.num_positions() > 0:
             show_twins(station, list(bodies.values()) if station.simulated else [])
         station.builder.ExportOutput(
@@ -428,6 +384,14 @@ class Station(Diagram):
         self.end_time = math.inf if station.simulated else station.end_time
         station.builder.BuildInto(self)
         self.set_name("station")
+
+
+def _faults_by_port(robots: dict[str, RobotParameters]) -> dict[str, list[Fault]]:
+    faults: dict[str, list[Fault]] = {}
+    for name, robot in robots.items():
+        for fault in robot.faults:
+            faults.setdefault(f"{name}.{fault.signal}", []).append(fault)
+    return faults
 
 
 def _static_transforms(

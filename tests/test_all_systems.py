@@ -93,6 +93,7 @@ from systems.planners.astar import AStarPlanner
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor
 from systems.planners.waypoint_sequencer import WaypointSequencer
+from systems.sensors.faults import Fault, FaultInjector
 from systems.sensors.imu import Imu, ImuParameters
 from systems.sensors.lidar import Lidar, LidarParameters
 from systems.sensors.rendered_camera import RenderedCamera
@@ -376,6 +377,12 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "path": (PlannedPath(), PlannedPath(stamp=0.0, points=np.eye(2))),
         },
     ),
+    FaultInjector: lambda _: Case(
+        FaultInjector(
+            model=3, faults=[Fault("imu.sample", "nan", 9.0)], rate=10.0, seed=0, name="faults"
+        ),
+        {"input": vector(1.0, 2.0, 3.0)},
+    ),
     Recorder: recorder,
     RenderedCamera: lambda _: Case(
         RenderedCamera(
@@ -596,7 +603,8 @@ def test_it_steps_and_sends_what_it_says(kind: type, case: Case) -> None:
     for name, value in outputs(case.system, simulate(case)).items():
         said = described["output", name]
         if isinstance(value, np.ndarray):
-            assert said.startswith("vector of "), f"{name} is a vector, said to be {said}"
+            vector = said.startswith("vector of ") or said == "of the type of `model`"
+            assert vector, f"{name} is a vector, said to be {said}"
             assert np.isfinite(value).all() or name in case.nan_outputs
         else:
             assert said in (type(value).__name__, "of the type of `nothing`")

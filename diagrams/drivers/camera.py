@@ -88,8 +88,11 @@ class Camera:
         images, found = image_signal(name, self.rate), detections_signal(name, self.rate)
         image, detections = self._sources(station, robot, name, camera)
         if image is None:
+            if images.port in station.faults:
+                raise ScenarioError(f"faults: there are no pictures here; let {found.port} fail")
             no_image = ConstantValueSource(AbstractValue.Make(CameraImage(frame_id=frame_id)))
             image = station.add(no_image, f"{name}.no_image").get_output_port()
+        image = station.spoiled(image, images)
         if detections is None:
             detector = station.add(
                 Detector(
@@ -145,7 +148,7 @@ class Camera:
             return None, station.play(detections_signal(name, self.rate))
         frame_id = name.replace(".", "/")
         if (self.sight or station.sight) == "projected":
-            markers = placed_markers(station.marker_map, station.scene_graph.world_frame_id())
+            markers = placed_markers(station.true_markers, station.scene_graph.world_frame_id())
             projector = station.add(
                 MarkerProjector(
                     camera=camera,

@@ -10,7 +10,7 @@ import pytest
 
 from diagrams.scenario import load_scenario, save_scenario
 from diagrams.schema import ScenarioError, to_plain
-from diagrams.station import TagList
+from diagrams.world import TagList
 from plants.random_arena import RandomArenaParameters, random_arena
 
 Writer = Callable[..., Path]
