@@ -294,8 +294,9 @@ def choose(view: View, parameters: DwaParameters, hull: Hull) -> Choice:
         meets = contact_times(near, hull, np.zeros(2), spin)
         may = meets > p.reaction_time + p.max_turn_rate / p.max_turn_acceleration / 2
         return Choice(None, angles, crowded, free, turns=np.where(may, p.max_turn_rate, 0.0))
-    # Standing still is no way out while there is one.
-    moves = admissible & ((v >= p.least_speed) | (np.abs(omega) > _STRAIGHT))
+    # To stand still is no way out while there is one, nor is turning to and fro on the spot: there
+    # it turns toward the goal only.
+    moves = admissible & ((v >= p.least_speed) | (omega * np.sign(bearing) > _STRAIGHT))
     best = int(np.argmax(np.where(moves, value, -math.inf)))
     to_goal = straight_room(points, room, *np.array([[0.0], [0.0], [bearing]]))[0]
     clear = bool(to_goal >= enough)

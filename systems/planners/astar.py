@@ -50,7 +50,8 @@ class AStarParameters:
         radius: nothing occupied may come nearer to the robot's centre than this, m, nor than the
             circle that holds the hull.
         soft_margin: beyond the radius, ways cost more up to this distance, m.
-        soft_cost: extra cost of a metre at the radius; falls with the square to 0 at soft_margin.
+        soft_cost: extra cost of a metre at the radius; falls with the square to 0 at soft_margin. A
+            detour of some metres is better than a gap that the avoider may shrink from.
         unknown_cost: extra cost of a metre of what has not been seen.
         occupied_above: log-odds above which a cell is occupied.
         escape: how far start and goal are moved out of what is too near to an obstacle, m.
@@ -63,7 +64,7 @@ class AStarParameters:
 
     radius: float = 0.15
     soft_margin: float = 0.2
-    soft_cost: float = 3.0
+    soft_cost: float = 8.0
     unknown_cost: float = 0.5
     occupied_above: float = 0.5
     escape: float = 0.5

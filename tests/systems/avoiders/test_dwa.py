@@ -154,6 +154,23 @@ def test_every_command_leaves_room_to_stop() -> None:
     assert driven > 20
 
 
+def test_on_the_spot_it_turns_toward_the_goal_only() -> None:
+    """Else it may turn to and fro for ever, between two windows that each prefer the other."""
+    random = np.random.default_rng(6)
+    turned = 0
+    for _ in range(300):
+        points = random.uniform(-0.5, 0.5, (12, 2))
+        points = points[distance_outside(points, HULL) > 0.04]
+        goal = random.uniform(-1.0, 1.0, 2)
+        twist = np.array([0.0, random.uniform(-0.3, 0.3)])
+        choice = choose(view(points, goal=goal, twist=twist), P, HULL)
+        if choice.bearing is None or choice.command[0] >= P.least_speed:
+            continue
+        turned += 1
+        assert choice.command[1] * math.atan2(goal[1], goal[0]) > 0
+    assert turned > 10
+
+
 def test_it_slows_down_before_a_wall() -> None:
     speeds = []
     for x in (1.0, 0.45, 0.35, 0.28):
