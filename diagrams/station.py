@@ -27,7 +27,7 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, Output
 
 from diagrams.channels import Signal
 from diagrams.schema import ScenarioError
-from diagrams.surroundings import add_clearance, add_motion, show_twins
+from diagrams.surroundings import add_clearance, add_motion, let_wait, show_twins
 from diagrams.tables import Choice, Table
 from diagrams.world import WorldParameters
 from plants.arena import add_arena
@@ -357,7 +357,7 @@ class Station(Diagram):
             for robot in bodies.values():
                 robot.body.add_model(station.plant, robot)
         station.plant.Finalize()
-        moving = add_motion(station)
+        moving = add_motion(station, len(bodies) if station.simulated else 0)
         for name, robot in bodies.items():
             if station.simulated:
                 robot.body.add_state(station, robot)
@@ -367,6 +367,8 @@ class Station(Diagram):
             for device, sensor in robots[name].sensors.items():
                 sensor.build().add(station, robot, device)
             add_clearance(station, robot, moving)
+        if station.simulated:
+            let_wait(station, list(bodies.values()))
         for port in station.faults:
             known = [signal.port for signal in station.signals]
             raise ScenarioError(f"faults: there is no signal {port}; {nearest(port, known)}")

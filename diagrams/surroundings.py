@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydrake.systems.framework import OutputPort
-from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain
+from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain, Multiplexer
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from diagrams.channels import Signal
@@ -24,11 +24,12 @@ if TYPE_CHECKING:
     from diagrams.station import Robot, StationBuilder
 
 
-def add_motion(station: StationBuilder) -> OutputPort | None:
+def add_motion(station: StationBuilder, robots: int) -> OutputPort | None:
     """Makes the moving obstacles move in a multibody plant.
 
     Args:
         station: its plant is finalized.
+        robots: how many there are, for whom the obstacles may wait (see `let_wait`).
 
     Returns:
         The port of their true positions, [x, y, ...] (m); None when nothing moves.
@@ -36,7 +37,7 @@ def add_motion(station: StationBuilder) -> OutputPort | None:
     moving = station.world.arena.moving
     if not moving:
         return None
-    motion = station.add(MovingObstacles(cylinders=moving), "moving")
+    motion = station.add(MovingObstacles(cylinders=moving, robots=robots), "moving")
     if station.dynamics == "kinematic":
         return motion.positions_output_port()
     plant = station.plant
@@ -55,6 +56,22 @@ def add_motion(station: StationBuilder) -> OutputPort | None:
     positions = station.add(to_positions, "moving_positions")
     station.connect(plant.get_state_output_port(model), positions.get_input_port())
     return positions.get_output_port()
+
+
+def let_wait(station: StationBuilder, robots: list[Robot]) -> None:
+    """Shows moving obstacles where the robots are, if there are such obstacles.
+
+    Args:
+        station: with `add_motion` done.
+        robots: all of them, with their states.
+    """
+    if not station.world.arena.moving:
+        return
+    poses = station.add(Multiplexer([3] * len(robots)), "robot_poses")
+    for k, robot in enumerate(robots):
+        station.connect(robot.state.GetOutputPort("planar_pose"), poses.get_input_port(k))
+    motion = station.builder.GetSubsystemByName("moving")
+    station.connect(poses.get_output_port(), motion.GetInputPort("robots"))
 
 
 def show_twins(station: StationBuilder, robots: list[Robot]) -> None:

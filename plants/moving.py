@@ -1,4 +1,4 @@
-"""Cylinders that travel back and forth: where they are is a function of time alone."""
+"""Cylinders that travel back and forth, blind or with courtesy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,13 @@ from pydrake.multibody.tree import (
     PrismaticJoint,
     SpatialInertia,
 )
-from pydrake.systems.framework import Context, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    Context,
+    DiscreteValues,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+)
 
 from plants.obstacles import CylinderObstacle, require_point
 from plants.planar_shapes import PlanarShapes
@@ -50,6 +56,8 @@ class MovingCylinder:
         path: [[x, y], ...], at least two points, m.
         speed: m/s.
         pause: at each end, s.
+        courtesy: it waits while the middle of a robot is ahead of it and nearer to its surface than
+            this, m; with 0 it looks for nobody.
     """
 
     radius: float
@@ -57,10 +65,11 @@ class MovingCylinder:
     speed: float
     height: float = 0.6
     pause: float = 0.0
+    courtesy: float = 0.0
 
     def __post_init__(self) -> None:
         require_positive(radius=self.radius, height=self.height, speed=self.speed)
-        require_non_negative(pause=self.pause)
+        require_non_negative(pause=self.pause, courtesy=self.courtesy)
         require(len(self.path) > 1, "path", self.path, "at least two points [x, y]")
         for k, point in enumerate(self.path):
             require_point(f"path[{k}]", point)
@@ -68,7 +77,7 @@ class MovingCylinder:
             require(a != b, f"path[{k + 1}]", b, "another point than the one before")
 
     def motion(self, t: float) -> tuple[Array, Array]:
-        """Returns where the axis is, (2,) m, and its velocity, (2,) m/s, at time t (s)."""
+        """Returns where the axis is, (2,) m, and its velocity, (2,) m/s, t s after the start."""
         points = np.array(self.path)
         legs = np.diff(points, axis=0)
         lengths = np.sqrt((legs * legs).sum(axis=1))
@@ -86,6 +95,13 @@ class MovingCylinder:
         position = points[leg] + direction * (along - ends[leg] + lengths[leg])
         pace = 0.0 if phase >= way else -self.speed if back else self.speed
         return position, pace * direction
+
+    def is_hindered(self, t: float, robots: Array) -> bool:
+        """Whether one of the robots (k, 2) m is so near ahead that courtesy makes it wait."""
+        position, velocity = self.motion(t)
+        offset = robots - position
+        near = np.hypot(offset[:, 0], offset[:, 1]) - self.radius < self.courtesy
+        return bool((near & (offset @ velocity > 0)).any())
 
     def at_start(self) -> CylinderObstacle:
         """Returns the cylinder as it stands at t = 0."""
@@ -110,14 +126,20 @@ class MovingObstacles(LeafSystem):
     .. pydrake_system::
 
         name: MovingObstacles
+        input_ports:
+        - robots
         output_ports:
         - positions
         - desired_state
 
     Args:
         cylinders: at least one.
+        robots: how many robots they may have to wait for.
+        rate: how often they look for them, Hz.
 
     Ports:
+        robots (input, vector of 3 for each robot): [x (m), y (m), theta (rad), ...] of base_link in
+            the world. May be left unconnected; then nobody waits.
         positions (output, vector of 2 for each cylinder): [x, y, ...] of their axes in the world,
             m.
         desired_state (output, vector of 4 for each cylinder): for the actuators of
@@ -125,18 +147,32 @@ class MovingObstacles(LeafSystem):
             (m), then all velocities [x, y, ...] (m/s).
     """
 
-    def __init__(self, *, cylinders: Sequence[MovingCylinder]) -> None:
+    def __init__(
+        self, *, cylinders: Sequence[MovingCylinder], robots: int = 0, rate: float = 50.0
+    ) -> None:
         super().__init__()
         require(len(cylinders) > 0, "cylinders", cylinders, "at least one")
+        require_positive(rate=rate)
         self._cylinders = tuple(cylinders)
         self._starts = starting_points(cylinders)
-        size, time_only = 2 * len(cylinders), {self.time_ticket()}
+        n = len(cylinders)
+        self._robots_input = self.DeclareVectorInputPort("robots", 3 * robots)
+        # How long each has waited before, and since when it waits; NaN while it travels.
+        self._waited = self.DeclareDiscreteState(np.zeros(n))
+        self._since = self.DeclareDiscreteState(np.full(n, np.nan))
+        if robots and any(cylinder.courtesy > 0 for cylinder in cylinders):
+            self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        depends_on = {self.time_ticket(), self.xd_ticket()}
         self._positions_output = self.DeclareVectorOutputPort(
-            "positions", size, self._calc_positions, time_only
+            "positions", 2 * n, self._calc_positions, depends_on
         )
         self._desired_state_output = self.DeclareVectorOutputPort(
-            "desired_state", 2 * size, self._calc_desired_state, time_only
+            "desired_state", 4 * n, self._calc_desired_state, depends_on
         )
+
+    def robots_input_port(self) -> InputPort:
+        """Returns the port of the robots' poses."""
+        return self._robots_input
 
     def positions_output_port(self) -> OutputPort:
         """Returns the port of the positions."""
@@ -146,15 +182,40 @@ class MovingObstacles(LeafSystem):
         """Returns the port of displacements and velocities."""
         return self._desired_state_output
 
+    def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if not self._robots_input.HasValue(context):
+            return
+        now = context.get_time()
+        robots = self._robots_input.Eval(context).reshape(-1, 3)[:, :2]
+        waited = context.get_discrete_state(self._waited).get_value().copy()
+        since = context.get_discrete_state(self._since).get_value().copy()
+        for k, (cylinder, travelled) in enumerate(self._travelled(context)):
+            if cylinder.is_hindered(travelled, robots):
+                since[k] = now if np.isnan(since[k]) else since[k]
+            elif not np.isnan(since[k]):
+                waited[k] += now - since[k]
+                since[k] = np.nan
+        discrete_state.set_value(self._waited, waited)
+        discrete_state.set_value(self._since, since)
+
+    def _travelled(self, context: Context) -> list[tuple[MovingCylinder, float]]:
+        """Returns each cylinder and for how long it has travelled or paused, s."""
+        since = context.get_discrete_state(self._since).get_value()
+        waited = context.get_discrete_state(self._waited).get_value()
+        times = np.where(np.isnan(since), context.get_time(), since) - waited
+        return list(zip(self._cylinders, times.tolist(), strict=True))
+
     def _calc_positions(self, context: Context, output: Any) -> None:
-        t = context.get_time()
-        output.SetFromVector(np.concatenate([c.motion(t)[0] for c in self._cylinders]))
+        output.SetFromVector(np.concatenate([c.motion(t)[0] for c, t in self._travelled(context)]))
 
     def _calc_desired_state(self, context: Context, output: Any) -> None:
-        t = context.get_time()
-        positions, velocities = zip(*(c.motion(t) for c in self._cylinders), strict=True)
+        positions, velocities = zip(
+            *(c.motion(t) for c, t in self._travelled(context)), strict=True
+        )
+        waiting = ~np.isnan(context.get_discrete_state(self._since).get_value())
+        rates = np.where(waiting[:, None], 0.0, velocities)
         displacements = np.concatenate(positions) - self._starts
-        output.SetFromVector(np.concatenate([displacements, *velocities]))
+        output.SetFromVector(np.concatenate([displacements, rates.ravel()]))
 
 
 def starting_points(cylinders: Sequence[MovingCylinder]) -> Array:

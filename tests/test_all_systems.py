@@ -346,7 +346,11 @@ CASES: dict[type, Callable[[Path], Case]] = {
         },
     ),
     MovingObstacles: lambda _: Case(
-        MovingObstacles(cylinders=[MovingCylinder(radius=0.1, path=[[0, 0], [1, 0]], speed=0.3)])
+        MovingObstacles(
+            cylinders=[MovingCylinder(radius=0.1, path=[[0, 0], [1, 0]], speed=0.3, courtesy=0.5)],
+            robots=1,
+        ),
+        {"robots": vector(0.5, 0.1, 0.0)},
     ),
     PlanarEkf: lambda _: Case(
         PlanarEkf(),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,7 @@ def test_it_moves_as_fast_as_it_says_and_never_jumps() -> None:
         ({"height": -1.0}, "height is -1.0: must be greater than 0"),
         ({"speed": 0.0}, "speed is 0.0: must be greater than 0"),
         ({"pause": -0.1}, "pause is -0.1: must be 0 or greater"),
+        ({"courtesy": -0.1}, "courtesy is -0.1: must be 0 or greater"),
         ({"path": [[0.0, 0.0]]}, r"path is \[\[0.0, 0.0\]\]: must be at least two points"),
         ({"path": [[0.0, 0.0], [1.0]]}, r"path\[1\] is \[1.0\]: must be \[x, y\] in metres"),
         ({"path": [[0.0, 0.0], [1.0, math.nan]]}, r"path\[1\] is .*: must be \[x, y\] in metres"),
@@ -155,3 +157,49 @@ def test_the_ports_say_the_same() -> None:
     np.testing.assert_allclose(positions, [3.0, 1.0, 1.0, -0.5])
     np.testing.assert_allclose(desired[:4], positions - [0.0, 0.0, 1.0, -1.0])
     np.testing.assert_allclose(desired[4:], [0.0, 2.0, 0.0, 0.25])
+
+
+POLITE = MovingCylinder(radius=0.1, path=[[0.0, 0.0], [2.0, 0.0]], speed=0.5, courtesy=0.3)
+
+
+def places(cylinder: MovingCylinder, robot: Any, times: np.ndarray) -> np.ndarray:
+    """x of a cylinder and its wanted speed at those times, with one robot at `robot(t)` (x, y)."""
+    builder = DiagramBuilder()
+    motion = builder.AddSystem(MovingObstacles(cylinders=[cylinder], robots=1))
+    diagram = builder.Build()
+    simulator = Simulator(diagram)
+    context = motion.GetMyContextFromRoot(simulator.get_mutable_context())
+    found = []
+    for t in times:
+        motion.robots_input_port().FixValue(context, [*robot(t), 0.0])
+        simulator.AdvanceTo(t)
+        x = motion.positions_output_port().Eval(context)[0]
+        found.append([x, motion.desired_state_output_port().Eval(context)[2]])
+    return np.array(found)
+
+
+def test_it_waits_for_a_robot_ahead_and_goes_on_when_it_has_gone() -> None:
+    times = np.arange(0.02, 6.0, 0.02)
+    x, v = places(POLITE, lambda t: (1.0, 0.1) if t < 3.0 else (1.0, 3.0), times).T
+    # Where the robot's middle is 0.3 m from its surface.
+    stop = 1.0 - np.sqrt(0.4**2 - 0.1**2)
+    waiting = (times > stop / 0.5 + 0.05) & (times < 3.0)
+    np.testing.assert_allclose(x[waiting], stop, atol=0.5 * 0.04)
+    assert np.ptp(x[waiting]) == 0
+    assert (v[waiting] == 0).all()
+    after = (times > 3.05) & (times < 5.5)  # before it turns back
+    np.testing.assert_allclose(x[after], x[waiting][0] + 0.5 * (times[after] - 3.0), atol=0.03)
+    assert (np.abs(np.diff(x)) <= 0.5 * 0.02 + 1e-9).all()  # it never jumps
+
+
+@pytest.mark.parametrize("robot", [(1.0, 0.41), (-0.15, 0.0)])
+def test_it_does_not_wait_for_what_it_passes_or_leaves_behind(robot: tuple[float, float]) -> None:
+    times = np.arange(0.02, 3.0, 0.02)
+    x, _ = places(POLITE, lambda _: robot, times).T
+    np.testing.assert_allclose(x, 0.5 * times, atol=1e-9)
+
+
+def test_without_courtesy_it_looks_for_nobody() -> None:
+    times = np.arange(0.02, 3.0, 0.02)
+    x, _ = places(replace(POLITE, courtesy=0.0), lambda _: (1.0, 0.0), times).T
+    np.testing.assert_allclose(x, 0.5 * times, atol=1e-9)
