@@ -23,6 +23,7 @@ bench: $(READY) renderer  ## prints speeds and accuracies beside those of the pe
 validate: $(READY) renderer  ## runs what needs the real recordings, and the slow checks
 	$(RUN)python -m pytest -m recording
 	$(RUN)python -m tests.benchmarks.validate
+	$(RUN)python -m tests.benchmarks.validate_robot
 
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
