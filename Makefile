@@ -10,7 +10,7 @@ demo: $(READY) renderer  ## runs the bundled navigation scenario
 	$(RUN)tagtrail run navigation --out out/demo
 
 test: $(READY) renderer  ## runs the tests
-	$(RUN)python -m pytest -m "not recording"
+	$(RUN)python -m pytest -m "not recording" -n auto --maxprocesses 8 --dist loadfile
 
 lint: $(READY)  ## checks style, formatting and types
 	$(RUN)ruff check
