@@ -353,9 +353,10 @@ class DwaAvoider(Avoider):
         command (output, vector of 2): [v (m/s), omega (rad/s)], at `rate`; zeros when it stops.
 
     Source: [DWA]. The objective is the weighted sum of heading, clearance and velocity, without
-    smoothing. We differ in that clearance goes on straight at the end of the arc (along a slow arc
-    alone everything looks clear), in the rectangular hull, whose contact with the points is exact,
-    and in that nothing beyond the goal counts. As in [DWA], what moves is taken to stand: the robot
+    smoothing. We differ in a fourth term, the room beside the hull; in that clearance goes on
+    straight at the end of the arc (along a slow arc alone everything looks clear); in the
+    rectangular hull, whose contact with the points is exact; in that nothing beyond the goal
+    counts; and in that it turns on the spot toward the goal only. As in [DWA], what moves is taken to stand: the robot
     stops before it, but may be run into.
 
     Raises:
