@@ -356,8 +356,8 @@ class DwaAvoider(Avoider):
     smoothing. We differ in a fourth term, the room beside the hull; in that clearance goes on
     straight at the end of the arc (along a slow arc alone everything looks clear); in the
     rectangular hull, whose contact with the points is exact; in that nothing beyond the goal
-    counts; and in that it turns on the spot toward the goal only. As in [DWA], what moves is taken to stand: the robot
-    stops before it, but may be run into.
+    counts; and in that it turns on the spot toward the goal only. As in [DWA], what moves is taken
+    to stand: the robot stops before it, but may be run into.
 
     Raises:
         ValueError: rate, lidar_pose or hull out of range.
