@@ -62,8 +62,9 @@ class Scenario:
         duration: the run ends by then, s.
         time_step: of the multibody plant, s.
         dynamics: `multibody` (wheels, contact, slip) or `kinematic` (the robots' kinematic twins).
-        sight: what the cameras' detections come from: `rendered` pictures, or markers `projected`
-            from the true poses with pixel noise (hundreds of times faster).
+        sight: what the cameras' detections come from: `rendered` pictures, pictures `drawn` without
+            shadows and textures (several times faster), or markers `projected` from the true poses
+            with pixel noise (hundreds of times faster).
         recording: a recording whose sensors are played back instead of simulated ones.
         record: what the run writes.
     """
@@ -75,7 +76,7 @@ class Scenario:
     duration: float = 60.0
     time_step: float = 0.005
     dynamics: Literal["multibody", "kinematic"] = "multibody"
-    sight: Literal["rendered", "projected"] = "rendered"
+    sight: Literal["rendered", "drawn", "projected"] = "rendered"
     recording: Annotated[str, Existing()] | None = None
     record: RecordParameters = field(default_factory=RecordParameters)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydrake.common.value import AbstractValue
@@ -21,6 +21,7 @@ from systems.io.ros_vision import camera_to_ros, image_from_ros
 from systems.markers.detector import Detector, DetectorParameters, MarkerDetector
 from systems.markers.projector import MarkerProjector, ProjectorParameters, placed_markers
 from systems.messages import CameraImage, Health
+from systems.sensors.drawn_camera import DrawnCamera
 from systems.sensors.rendered_camera import RenderedCamera
 from systems.validation import require, require_non_negative, require_positive
 
@@ -41,7 +42,7 @@ class Camera:
         latency: from the middle of the exposure to the arrival of the picture, s.
         position: [x, y, z] of the optical centre in base_link, m.
         rpy_deg: roll, pitch, yaw of the camera; zeros look forward, positive pitch looks down.
-        sight: `rendered` or `projected`; left out, the scenario's.
+        sight: `rendered`, `drawn` or `projected`; left out, the scenario's.
         effects: what lens and sensor do to rendered pictures.
         detector: how markers are found in pictures.
         projector: how markers are found without pictures.
@@ -52,7 +53,7 @@ class Camera:
     latency: float = 0.0
     position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.1])
     rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
-    sight: Literal["rendered", "projected"] | None = None
+    sight: Literal["rendered", "drawn", "projected"] | None = None
     effects: ImageEffects = field(default_factory=ImageEffects)
     detector: DetectorParameters = field(default_factory=DetectorParameters)
     projector: ProjectorParameters = field(default_factory=ProjectorParameters)
@@ -147,8 +148,9 @@ class Camera:
                 return image, None
             return None, station.play(detections_signal(name, self.rate))
         frame_id = name.replace(".", "/")
-        if (self.sight or station.sight) == "projected":
-            markers = placed_markers(station.true_markers, station.scene_graph.world_frame_id())
+        sight = self.sight or station.sight
+        markers = placed_markers(station.true_markers, station.scene_graph.world_frame_id())
+        if sight == "projected":
             projector = station.add(
                 MarkerProjector(
                     camera=camera,
@@ -170,27 +172,31 @@ class Camera:
                 station.scene_graph.get_query_output_port(), projector.query_object_input_port()
             )
             return None, projector.detections_output_port()
-        station.need_renderer()
-        try:
-            sensor = RenderedCamera(
-                camera=camera,
-                parent_frame=robot.frame_id,
-                X_PC=self.mounting(),
-                renderer=RENDERER,
-                rate=self.rate,
-                latency=self.latency,
-                effects=self.effects,
-                seed=station.seed,
-                name=name,
-                frame_id=frame_id,
-            )
-        except ValueError as error:  # a distortion that cannot be rendered
-            raise ScenarioError(f"camera file {self.calibration}: {error}") from error
-        rendered = station.add(sensor, name)
+        shared: dict[str, Any] = {
+            "camera": camera,
+            "parent_frame": robot.frame_id,
+            "X_PC": self.mounting(),
+            "rate": self.rate,
+            "latency": self.latency,
+            "effects": self.effects,
+            "seed": station.seed,
+            "name": name,
+            "frame_id": frame_id,
+        }
+        sensor: DrawnCamera | RenderedCamera
+        if sight == "drawn":
+            sensor = DrawnCamera(markers=markers, family=station.marker_map.family, **shared)
+        else:
+            station.need_renderer()
+            try:
+                sensor = RenderedCamera(renderer=RENDERER, **shared)
+            except ValueError as error:  # a distortion that cannot be rendered
+                raise ScenarioError(f"camera file {self.calibration}: {error}") from error
+        station.add(sensor, name)
         station.connect(
-            station.scene_graph.get_query_output_port(), rendered.query_object_input_port()
+            station.scene_graph.get_query_output_port(), sensor.query_object_input_port()
         )
         station.connect(
-            robot.state.GetOutputPort("spatial_velocity"), rendered.spatial_velocity_input_port()
+            robot.state.GetOutputPort("spatial_velocity"), sensor.spatial_velocity_input_port()
         )
-        return rendered.image_output_port(), None
+        return sensor.image_output_port(), None

@@ -26,7 +26,8 @@ def refusal(path: Path | str, overrides: Any = ()) -> str:
     ("override", "message"),
     [
         ("sihgt=projected", "--set sihgt: sihgt: unknown key; did you mean 'sight'?"),
-        ("sight=drawn", "--set sight: sight is 'drawn': must be one of rendered, projected"),
+        ("sight=painted",
+         "--set sight: sight is 'painted': must be one of rendered, drawn, projected"),
         ("seed=1.5", "--set seed: seed is 1.5: must be a whole number"),
         ("seed=1e3", "--set seed: seed is 1000.0: must be a whole number"),
         ("seed=-1", "--set seed: seed is -1: must be a whole number from 0 to 2^53 - 1"),
@@ -47,7 +48,7 @@ def refusal(path: Path | str, overrides: Any = ()) -> str:
          "three finite numbers"),
         ("robot.sensors.front_camera.sight=real",
          "--set robot.sensors.front_camera.sight: robot.sensors.front_camera.sight is 'real': "
-         "must be one of rendered, projected"),
+         "must be one of rendered, drawn, projected"),
         ("camera=imu",
          "--set camera: camera is 'imu': must be one of the robot's sensors that fit: "
          "front_camera"),

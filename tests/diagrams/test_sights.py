@@ -1,4 +1,4 @@
-"""Projected sight is fitted to rendered sight: here both look at the bundled arena."""
+"""Projected sight is fitted to rendered sight, drawn sight shows the same: in the bundled arena."""
 
 from __future__ import annotations
 
@@ -48,6 +48,7 @@ def corners() -> dict[str, dict[tuple[int, int], np.ndarray]]:
     silent = (f"{projector}.pixel_noise=0", f"{projector}.pixel_noise_by_side=0")
     sights = {
         "rendered": ("sight=rendered",),
+        "drawn": ("sight=drawn",),
         "projected": ("sight=projected",),
         "exact": ("sight=projected", *silent, f"{projector}.min_side_px=4"),
     }
@@ -62,7 +63,7 @@ def corners() -> dict[str, dict[tuple[int, int], np.ndarray]]:
     }
 
 
-@pytest.mark.parametrize("sight", ["rendered", "projected"])
+@pytest.mark.parametrize("sight", ["rendered", "drawn", "projected"])
 def test_the_corner_noise_is_as_the_scenario_has_it(
     corners: dict[str, dict[tuple[int, int], np.ndarray]], sight: str
 ) -> None:
@@ -77,14 +78,17 @@ def test_the_corner_noise_is_as_the_scenario_has_it(
         assert len(some) >= 20
         rms = np.sqrt((some**2).mean())
         print(f"{sight}, {low} to {high} px: {len(some)} markers, {rms:.2f} of the model")
-        assert 0.75 < rms < 1.3
+        # A drawn picture lacks what the renderer's sampling adds.
+        assert (0.3 if sight == "drawn" else 0.75) < rms < 1.3
         assert np.abs(some.mean(axis=(0, 1))).max() < 0.3  # no shift
 
 
 def test_what_is_found_is_the_same(
     corners: dict[str, dict[tuple[int, int], np.ndarray]],
 ) -> None:
-    rendered, projected = corners["rendered"].keys(), corners["projected"].keys()
-    assert len(rendered | projected) > 150
-    assert len(projected - rendered) < 0.06 * len(projected)
-    assert len(rendered - projected) < 0.06 * len(rendered)
+    rendered = corners["rendered"].keys()
+    assert len(rendered) > 150
+    for sight in ("drawn", "projected"):
+        others = corners[sight].keys()
+        assert len(others - rendered) < 0.06 * len(others)
+        assert len(rendered - others) < 0.06 * len(rendered)
