@@ -11,10 +11,13 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from scipy.signal import periodogram
 
 from plants.body_state import BodyState
+from systems.noise import generator, stream_key
 from systems.sensors.imu import (
     GRAVITY,
+    Bmi088Parameters,
     Imu,
     ImuParameters,
     Mpu6050Parameters,
@@ -365,6 +368,104 @@ def test_it_does_not_matter_how_often_it_is_looked_at() -> None:
         np.testing.assert_array_equal(found, once[29])
 
 
+def test_the_bmi088_counts_as_its_sheet_says() -> None:
+    p = Bmi088Parameters()
+    assert 2**15 / math.degrees(p.gyro_range or 0) == pytest.approx(262.144)  # LSB/(deg/s)
+    assert 2**15 / ((p.accel_range or 0) / GRAVITY) == 16384  # LSB/g, were there such a range
+    # 0.1 deg/s rms at a bandwidth of 47 Hz, by the same sheet.
+    assert math.degrees(p.gyro_noise_density) * math.sqrt(47.0) == pytest.approx(0.1, abs=0.005)
+    assert p.accel_noise_density == pytest.approx(190e-6 * 9.81)
+    assert [round(math.degrees(b), 6) for b in p.gyro_bias_tolerance] == [1.0] * 3
+    assert [b / GRAVITY for b in p.accel_bias_tolerance] == pytest.approx([0.02] * 3)
+    # The shaking is one motion: half a micrometre at 100 Hz, over 20 mm.
+    speed = 0.5e-6 * 2 * math.pi * p.vibration_frequency
+    assert p.accel_vibration == pytest.approx(
+        [speed * 2 * math.pi * p.vibration_frequency] * 3, rel=0.02
+    )
+    assert p.gyro_vibration == pytest.approx([speed / 0.020] * 3, rel=0.02)
+    # At rest at 300 Hz it shows all of that, in whole steps and about its offsets.
+    rows = samples(900, parameters=p, rate=300.0, seed=4)
+    gyro = math.hypot(p.gyro_vibration[0], p.gyro_noise_density * math.sqrt(300.0))
+    accel = math.hypot(p.accel_vibration[0], p.accel_noise_density * math.sqrt(300.0))
+    np.testing.assert_allclose(rows.std(axis=0), np.repeat([gyro, accel], 3), rtol=0.3)
+    steps = rows / np.repeat([math.radians(125.0), 2 * GRAVITY], 3) * 2**15
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
+    offset = rows.mean(axis=0) - [0, 0, 0, 0, 0, GRAVITY]
+    assert (np.abs(offset[:3]) < math.radians(1.05)).all()
+    assert (np.abs(offset[3:]) < 0.035 * GRAVITY).all()  # 1 % across the axes beside 20 mg
+
+
+SHAKEN = ImuParameters(
+    vibration_frequency=30.0,
+    vibration_bandwidth=4.0,
+    gyro_vibration=[0.1, 0.2, 0.0],
+    accel_vibration=[0.0, 1.0, 2.0],
+)
+SHAKE = np.array([0.1, 0.2, 0.0, 0.0, 1.0, 2.0])
+
+
+def test_the_vibration_has_its_strength_on_each_axis_from_the_first_sample_on() -> None:
+    first = np.array([samples(1, parameters=SHAKEN, seed=s)[0] for s in range(200)])
+    rows = samples(6000, parameters=SHAKEN)
+    for found, number in ((first, 200), (rows, 6000 / 100 * math.pi * 4.0)):
+        found = found - [0, 0, 0, 0, 0, GRAVITY]
+        assert (found[:, [2, 3]] == 0).all()
+        power = (found**2).mean(axis=0)[SHAKE > 0] / SHAKE[SHAKE > 0] ** 2
+        # So many independent draws tell a variance to sqrt(2 / number) of it.
+        np.testing.assert_allclose(power, 1.0, atol=4 * math.sqrt(2 / number))
+    shaking = rows[:, SHAKE > 0]
+    assert np.abs(np.corrcoef(shaking.T) - np.eye(4)).max() < 0.35  # each axis by itself
+
+
+@pytest.mark.parametrize(
+    ("rate", "shown"),
+    [(300.0, 30.0), (100.0, 30.0), (40.0, 10.0), (33.0, 3.0)],  # the last two are folded down
+)
+def test_the_vibration_lies_in_its_band_at_any_rate(rate: float, shown: float) -> None:
+    p = dataclasses.replace(SHAKEN, vibration_bandwidth=0.5)
+    n = int(100 * rate)
+    rows = (samples(n, parameters=p, rate=rate, seed=2) - [0, 0, 0, 0, 0, GRAVITY])[:, SHAKE > 0]
+    rows = rows / SHAKE[SHAKE > 0]
+    # Correlation of a band of the Cauchy shape about the middle, by its Fourier transform.
+    for lag in range(1, 8):
+        tau = lag / rate
+        expected = math.exp(-math.pi * 0.5 * tau) * math.cos(2 * math.pi * 30.0 * tau)
+        found = (rows[lag:] * rows[:-lag]).mean() / (rows**2).mean()
+        assert found == pytest.approx(expected, abs=0.05)
+    # Half of the power lies between the points of half power; it peaks at the middle.
+    frequency, density = periodogram(rows, fs=rate, axis=0)
+    power = density.sum(axis=1)
+    within = np.abs(frequency - shown) <= 0.25
+    assert power[within].sum() / power.sum() == pytest.approx(0.5, abs=0.1)
+    assert abs(frequency[power.argmax()] - shown) < 0.5
+
+
+def test_without_a_bandwidth_the_vibration_is_a_pure_tone() -> None:
+    p = dataclasses.replace(SHAKEN, vibration_bandwidth=0.0)
+    rows = samples(50, parameters=p) - [0, 0, 0, 0, 0, GRAVITY]
+    double = 2 * math.cos(2 * math.pi * 30.0 / 100.0)
+    np.testing.assert_allclose(rows[2:] + rows[:-2], double * rows[1:-1], atol=1e-12)
+    assert np.abs(rows[:, SHAKE > 0]).max(axis=0).min() > 0.01
+
+
+def test_the_vibration_is_motion_which_the_sensor_distorts_and_cuts_off() -> None:
+    rows = samples(200, parameters=SHAKEN)
+    wrong = dataclasses.replace(SHAKEN, accel_scale_tolerance=0.1)
+    scaled = samples(200, parameters=wrong)
+    gain = scaled[:, 4] / rows[:, 4]
+    np.testing.assert_allclose(gain, gain[0])
+    assert 0 < abs(gain[0] - 1) <= 0.1
+    cut = samples(200, parameters=dataclasses.replace(SHAKEN, accel_range=GRAVITY + 0.5))
+    np.testing.assert_allclose(cut, np.clip(rows, -GRAVITY - 0.5, GRAVITY + 0.5))
+    assert (cut[:, 5] == GRAVITY + 0.5).any()
+
+
+def test_a_sensor_that_does_not_vibrate_draws_what_it_always_drew() -> None:
+    found = samples(3, parameters=ImuParameters(gyro_noise_density=0.1), seed=8, name="it")
+    drawn = generator(stream_key(8, "it"), 0).standard_normal((64, 6))[:3, :3]
+    np.testing.assert_allclose(found[:, :3], 0.1 * 10.0 * drawn, atol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("field", "value"),
     [
@@ -381,6 +482,11 @@ def test_it_does_not_matter_how_often_it_is_looked_at() -> None:
         ("accel_noise_density", math.nan),
         ("gyro_bias", [0.0, 0.0]),
         ("accel_bias", [0.0, math.inf, 0.0]),
+        ("gyro_vibration", [0.1, -0.1, 0.1]),
+        ("accel_vibration", [0.1, math.nan, 0.1]),
+        ("accel_vibration", [0.1]),
+        ("vibration_frequency", -1.0),
+        ("vibration_bandwidth", math.inf),
     ],
 )
 def test_nonsense_is_refused(field: str, value: Any) -> None:
