@@ -233,3 +233,54 @@ class Health(Message):
     """
 
     counts: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class PointMatches(Message):
+    """Points of a scene found in two pictures of one camera: sparse optical flow.
+
+    Attributes:
+        stamp: time of the later picture, s; NaN when there is nothing to compare.
+        previous_stamp: time of the earlier picture, s.
+        frame_id: optical frame of the camera.
+        previous: (n, 2) px, in the earlier picture, counted from the centre of the first pixel.
+        current: (n, 2) px, the same points in the later one.
+    """
+
+    stamp: float = math.nan
+    previous_stamp: float = math.nan
+    frame_id: str = ""
+    previous: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    current: Array = field(default_factory=lambda: np.zeros((0, 2)))
+
+    def __len__(self) -> int:
+        return len(self.previous)
+
+
+@dataclass(frozen=True, eq=False)
+class RotationIncrement(Message):
+    """How far a body has turned relative to something it watches, between two pictures.
+
+    Attributes:
+        stamp: end of the interval, s; NaN when there is no increment.
+        previous_stamp: its beginning, s.
+        frame_id: the body's frame, in whose axes it is told.
+        rotation: (3,) rotation vector w, rad: the body's frame B turns from B1 to B2 by
+            `R_B1B2 = exp(w)`, as the integral of a gyro fixed to it.
+        covariance: (3, 3) of a further small rotation in the axes of B2, rad^2.
+        inliers: number of points that agree on it.
+        inlier_share: part of all matched points that they are.
+    """
+
+    stamp: float = math.nan
+    previous_stamp: float = math.nan
+    frame_id: str = ""
+    rotation: Array = field(default_factory=lambda: np.zeros(3))
+    covariance: Array = field(default_factory=lambda: np.full((3, 3), math.nan))
+    inliers: int = 0
+    inlier_share: float = 0.0
+
+    @property
+    def valid(self) -> bool:
+        """Whether there is an increment at all."""
+        return not math.isnan(self.stamp)

@@ -13,11 +13,20 @@ from systems.messages import (
     Detections,
     Health,
     Message,
+    PointMatches,
     PoseEstimate,
+    RotationIncrement,
     whole_nanoseconds,
 )
 
-MESSAGES: list[Message] = [CameraImage(), Detections(), PoseEstimate(), Health()]
+MESSAGES: list[Message] = [
+    CameraImage(),
+    Detections(),
+    PoseEstimate(),
+    Health(),
+    PointMatches(),
+    RotationIncrement(),
+]
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda m: type(m).__name__)
@@ -38,7 +47,9 @@ def test_copies_and_abstract_values_hold_the_same_object(message: Message) -> No
     assert value.Clone().get_value() is message
 
 
-@pytest.mark.parametrize("kind", [CameraImage, Detections, PoseEstimate])
+@pytest.mark.parametrize(
+    "kind", [CameraImage, Detections, PoseEstimate, PointMatches, RotationIncrement]
+)
 def test_without_a_measurement_the_stamp_is_nan(kind: type) -> None:
     assert math.isnan(kind().stamp)
 
@@ -46,6 +57,16 @@ def test_without_a_measurement_the_stamp_is_nan(kind: type) -> None:
 def test_a_pose_without_a_stamp_is_not_valid() -> None:
     assert not PoseEstimate().valid
     assert PoseEstimate(stamp=0.0).valid
+
+
+def test_an_increment_without_a_stamp_is_not_valid() -> None:
+    assert not RotationIncrement().valid
+    assert RotationIncrement(stamp=0.0).valid
+
+
+def test_matches_are_as_many_as_their_points() -> None:
+    assert len(PointMatches()) == 0
+    assert len(PointMatches(previous=np.zeros((3, 2)), current=np.ones((3, 2)))) == 3
 
 
 def test_detections_are_picked_by_mask_and_by_index() -> None:

@@ -1,0 +1,1 @@
+"""Optical flow over a spherical shell: points tracked in pictures, and the motion they tell."""

@@ -1,0 +1,185 @@
+"""Matches from true motion without a picture: what camera and point tracker would have found."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.eigen_geometry import Quaternion
+from pydrake.common.value import AbstractValue
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import Context, EventStatus, InputPort, OutputPort, State
+
+from systems.cameras import PinholeCamera
+from systems.flow.shell import back_project, inside, project
+from systems.messages import PointMatches, whole_nanoseconds
+from systems.noise import NoiseStream
+from systems.sensors.sampled import SampledSensor
+from systems.validation import require, require_non_negative, require_positive
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class FlowProjectorParameters:
+    """How many points are found again, and how well.
+
+    Attributes:
+        points: that are looked for in each picture.
+        pixel_noise: standard deviation of a match, each coordinate, px.
+        scale_error: all displacements are too long by this part; -0.02 for 2 % too short.
+        point_dropout: part of the points that is lost at random.
+        outlier_share: part of the matches that is wrong.
+        outlier_px: standard deviation of a wrong one, px.
+        picture_dropout: part of the pictures that gives no match at all.
+    """
+
+    points: int = 200
+    pixel_noise: float = 0.1
+    scale_error: float = 0.0
+    point_dropout: float = 0.1
+    outlier_share: float = 0.0
+    outlier_px: float = 20.0
+    picture_dropout: float = 0.0
+
+    def __post_init__(self) -> None:
+        require(self.points >= 1, "points", self.points, "1 or greater")
+        require_non_negative(pixel_noise=self.pixel_noise, outlier_px=self.outlier_px)
+        sound = math.isfinite(self.scale_error) and abs(self.scale_error) < 1
+        require(sound, "scale_error", self.scale_error, "between -1 and 1")
+        for name in ("point_dropout", "outlier_share", "picture_dropout"):
+            value = getattr(self, name)
+            require(0 <= value <= 1, name, value, "0 to 1")
+
+
+def project_flow(
+    *,
+    camera: PinholeCamera,
+    radius: float,
+    X_RC_before: RigidTransform,
+    X_RC: RigidTransform,
+    parameters: FlowProjectorParameters,
+    random: np.random.Generator,
+) -> tuple[Array, Array]:
+    """Returns what a tracker would find of points of a shell in two pictures.
+
+    The points lie evenly in the earlier picture, anew each time, as corners that are looked for
+    anew. Those that leave the picture, or the shell, are not found again.
+
+    Args:
+        camera: intrinsics.
+        radius: of the shell, m.
+        X_RC_before: pose of the optical frame at the earlier picture; R has its origin in the
+            shell's centre.
+        X_RC: at the later one.
+        parameters: number, noise and losses.
+        random: where they come from.
+
+    Returns:
+        (n, 2) px in the earlier picture, and (n, 2) px in the later one.
+    """
+    p = parameters
+    lost = random.random() < p.picture_dropout
+    previous = random.random((p.points, 2)) * [camera.width, camera.height] - 0.5
+    noise = p.pixel_noise * random.standard_normal((p.points, 2))
+    wrong = random.random(p.points) < p.outlier_share
+    noise += wrong[:, None] * p.outlier_px * random.standard_normal((p.points, 2))
+    found = random.random(p.points) >= p.point_dropout
+    current = project(camera, X_RC, back_project(camera, X_RC_before, radius, previous))
+    current = previous + (1 + p.scale_error) * (current - previous) + noise
+    found &= inside(camera, current) & (not lost)
+    return previous[found], current[found]
+
+
+class FlowProjector(SampledSensor):
+    """Matches points of a spherical shell without a picture, from the camera's true motion.
+
+    .. pydrake_system::
+
+        name: FlowProjector
+        input_ports:
+        - pose
+        output_ports:
+        - matches
+
+    Args:
+        camera: intrinsics.
+        radius: of the shell, m.
+        parameters: number of points, noise, scale error and losses.
+        rate: pictures a second, Hz.
+        latency: from a picture to the arrival of its matches, s.
+        seed: of the noise, a parameter of the Context.
+        name: of the noise stream.
+        frame_id: name of the optical frame in the messages.
+
+    Ports:
+        pose (input, RigidTransform): `X_RC`, of the camera's true optical frame; R has its origin
+            in the shell's centre and turns with the shell.
+        matches (output, PointMatches): of the last two pictures, sampled at `rate`, sent `latency`
+            later; the stamp is the later picture's time, NaN before the second. Without a match
+            (the camera looks past the shell, or the picture is lost) it has none.
+
+    Raises:
+        ValueError: radius, rate, latency or seed out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        camera: PinholeCamera,
+        radius: float = 0.075,
+        parameters: FlowProjectorParameters | None = None,
+        rate: float = 60.0,
+        latency: float = 0.0,
+        seed: int = 0,
+        name: str = "flow_projector",
+        frame_id: str = "camera_optical",
+    ) -> None:
+        super().__init__()
+        require_positive(radius=radius)
+        self._camera = camera
+        self._radius = radius
+        self._parameters = parameters or FlowProjectorParameters()
+        self._frame_id = frame_id
+        self._noise = NoiseStream(self, seed=seed, name=name)
+        self._pose_input = self.DeclareAbstractInputPort(
+            "pose", AbstractValue.Make(RigidTransform())
+        )
+        # Time, quaternion and position of the camera at the last picture.
+        self._last = self.DeclareDiscreteState(np.array([math.nan, 1, 0, 0, 0, 0, 0, 0]))
+        self._matches_output = self._declare_sampling(
+            name="matches", rate=rate, latency=latency, nothing=PointMatches(frame_id=frame_id)
+        )
+
+    def pose_input_port(self) -> InputPort:
+        """Returns the port of the camera's pose."""
+        return self._pose_input
+
+    def matches_output_port(self) -> OutputPort:
+        """Returns the port of the matches."""
+        return self._matches_output
+
+    def _measure(self, context: Context, stamp: float, index: int) -> PointMatches:
+        last = context.get_discrete_state(self._last).get_value()
+        if math.isnan(last[0]):
+            return PointMatches(frame_id=self._frame_id)
+        previous, current = project_flow(
+            camera=self._camera,
+            radius=self._radius,
+            X_RC_before=RigidTransform(RotationMatrix(Quaternion(last[1:5])), last[5:]),
+            X_RC=self._pose_input.Eval(context),
+            parameters=self._parameters,
+            random=self._noise.generator(context, index),
+        )
+        return PointMatches(stamp, float(last[0]), self._frame_id, previous, current)
+
+    def _take(self, context: Context, state: State) -> EventStatus:
+        status = super()._take(context, state)
+        X_RC: RigidTransform = self._pose_input.Eval(context)
+        wxyz = X_RC.rotation().ToQuaternion().wxyz()
+        stamp = whole_nanoseconds(context.get_time())
+        last = np.concatenate([[stamp], wxyz, X_RC.translation()])
+        state.get_mutable_discrete_state().set_value(self._last, last)
+        return status

@@ -1,0 +1,146 @@
+"""A camera that looks down at a spherical shell: from pixels to the surface and back.
+
+Frame S: origin in the shell's centre, axes of the body B that carries the camera (x forward, y
+left, z outward through the body). While the body drives over the shell, its camera stays where it
+is in S, and the points of the shell turn about S's origin.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.math import RigidTransform, RotationMatrix
+
+from systems.cameras import PinholeCamera
+from systems.markers.pnp import rotation_from_vector
+from systems.validation import require, require_positive
+
+Array = NDArray[np.float64]
+
+# Axes of an optical frame that looks along -z of the body, the top of its picture to the front.
+R_DOWN = np.array([[0.0, -1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+
+
+@dataclass
+class ShellViewParameters:
+    """Where the camera is over the shell.
+
+    Attributes:
+        radius: of the shell, m.
+        camera_height: of the optical centre above the surface, m.
+        camera_tilt: how the camera is turned away from looking straight down, with the top of its
+            picture to the front: rotation vector in B, rad.
+    """
+
+    radius: float = 0.075
+    camera_height: float = 0.010
+    camera_tilt: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def __post_init__(self) -> None:
+        require_positive(radius=self.radius, camera_height=self.camera_height)
+        sound = len(self.camera_tilt) == 3 and bool(np.isfinite(self.camera_tilt).all())
+        require(sound, "camera_tilt", self.camera_tilt, "three finite numbers (rad)")
+
+
+def looking_down(parameters: ShellViewParameters) -> RigidTransform:
+    """Returns the pose of the optical frame in S, `X_SC`."""
+    R = rotation_from_vector(np.array(parameters.camera_tilt, float)) @ R_DOWN
+    return RigidTransform(
+        RotationMatrix(R), [0.0, 0.0, parameters.radius + parameters.camera_height]
+    )
+
+
+def back_project(
+    camera: PinholeCamera, X_SC: RigidTransform, radius: float, pixels: Array
+) -> Array:
+    """Returns the points of the shell that pixels show.
+
+    Args:
+        camera: intrinsics.
+        X_SC: pose of the optical frame in a frame whose origin is the shell's centre.
+        radius: of the shell, m.
+        pixels: (n, 2) px.
+
+    Returns:
+        (n, 3) m, in S; NaN where a pixel shows none.
+    """
+    normalised = camera.undistort(pixels)
+    direction = np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1)
+    direction = direction @ X_SC.rotation().matrix().T
+    direction /= np.sqrt((direction * direction).sum(axis=1, keepdims=True))
+    origin = X_SC.translation()
+    along = direction @ origin
+    discriminant = along * along - (origin @ origin - radius * radius)
+    with np.errstate(invalid="ignore"):
+        distance = -along - np.sqrt(discriminant)
+    distance = np.where(distance > 0, distance, np.nan)
+    points: Array = origin + distance[:, None] * direction
+    return points
+
+
+def project(camera: PinholeCamera, X_SC: RigidTransform, points: Array) -> Array:
+    """Returns the pixels that show points of the shell.
+
+    Args:
+        camera: intrinsics.
+        X_SC: pose of the optical frame in a frame whose origin is the shell's centre.
+        points: (n, 3) m, on the shell, in S.
+
+    Returns:
+        (n, 2) px, NaN for points behind the camera, beyond the shell's horizon, or beyond where the
+        lens' model holds; pixels may lie outside the picture.
+    """
+    line = X_SC.translation() - points
+    p_C = -line @ X_SC.rotation().matrix()
+    seen = ((line * points).sum(axis=1) > 0) & (p_C[:, 2] > 0)
+    seen &= np.hypot(p_C[:, 0], p_C[:, 1]) < camera.fold_radius * p_C[:, 2]
+    pixels = np.full((len(points), 2), np.nan)
+    pixels[seen] = camera.project(p_C[seen])
+    return pixels
+
+
+class ShellView:
+    """A calibrated camera at its place over a shell.
+
+    Args:
+        camera: intrinsics.
+        parameters: the shell and the place.
+    """
+
+    def __init__(
+        self, *, camera: PinholeCamera, parameters: ShellViewParameters | None = None
+    ) -> None:
+        self.camera = camera
+        self.parameters = parameters or ShellViewParameters()
+        self.radius = self.parameters.radius
+        self.X_SC = looking_down(self.parameters)
+
+    def back_project(self, pixels: Array) -> Array:
+        """Returns the points (n, 3) m of the shell, in S, that pixels (n, 2) show; NaN for none."""
+        return back_project(self.camera, self.X_SC, self.radius, pixels)
+
+    def turned(self, pixels: Array, increment: Array) -> Array:
+        """Returns where points are seen after the body has turned about the shell's centre.
+
+        Args:
+            pixels: (n, 2) px, before.
+            increment: (3,) the body's rotation relative to the shell, `R_B1B2 = exp(increment)`,
+                rad.
+
+        Returns:
+            (n, 2) px, NaN where they are no longer seen.
+        """
+        R_B1B2 = rotation_from_vector(increment)
+        return project(self.camera, self.X_SC, self.back_project(pixels) @ R_B1B2)
+
+    def inside(self, pixels: Array) -> NDArray[np.bool_]:
+        """Returns which pixels (n, 2) are in the picture."""
+        return inside(self.camera, pixels)
+
+
+def inside(camera: PinholeCamera, pixels: Array) -> NDArray[np.bool_]:
+    """Returns which pixels (n, 2) are in the camera's picture; NaN is not."""
+    high = [camera.width - 0.5, camera.height - 0.5]
+    return np.asarray(((pixels >= -0.5) & (pixels <= high)).all(axis=1), bool)
