@@ -28,7 +28,7 @@ from pydrake.geometry import (
     Role,
 )
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ExternallyAppliedSpatialForce
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
     Context,
@@ -52,9 +52,13 @@ from plants.differential_drive import (
     add_differential_drive,
     wheel_speeds,
 )
+from plants.magnets import MagneticAdhesion
 from plants.motors import DcMotors, MotorModel, MotorParameters
 from plants.moving import MovingCylinder, MovingObstacles
 from plants.planar_shapes import PlanarShapes
+from plants.shell import ShellMotion, ShellParameters, add_shell
+from plants.shell_rover import ShellRover
+from plants.snailbot import SnailBotParameters, add_snailbot, stance
 from systems.angles import spatial_pose
 from systems.avoiders.dwa import DwaAvoider
 from systems.avoiders.sector import SectorAvoider
@@ -62,12 +66,20 @@ from systems.avoiders.vfh_plus import VfhPlus
 from systems.cameras import PinholeCamera
 from systems.controllers.collision_monitor import CollisionMonitor
 from systems.controllers.search import SearchWhenLost
+from systems.controllers.shell_route import Leg, ShellRoute
 from systems.controllers.waypoints import WaypointController
 from systems.controllers.wheel_drive import WheelDrive
 from systems.controllers.wheel_pwm import WheelPwm
 from systems.estimators.gyro_yaw import GyroYaw
+from systems.estimators.madgwick import Madgwick
 from systems.estimators.planar_ekf import PlanarEkf
 from systems.estimators.planar_kalman import PlanarKalmanFilter
+from systems.estimators.shell_rule import ShellRule
+from systems.flow.lucas_kanade import PointTracker
+from systems.flow.mean_flow import MeanFlow
+from systems.flow.projector import FlowProjector
+from systems.flow.shell import ShellView
+from systems.flow.sphere_flow import SphereFlow, SphereFlowEstimator
 from systems.image_effects import ImageEffects
 from systems.io.bag import BagWriter
 from systems.io.playback import Entry, MessagePlayback, VectorPlayback
@@ -83,7 +95,9 @@ from systems.messages import (
     Detections,
     Message,
     OccupancyGrid,
+    PointMatches,
     PoseEstimate,
+    RotationIncrement,
     Scan,
 )
 from systems.messages import (
@@ -93,11 +107,13 @@ from systems.planners.astar import AStarPlanner
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor
 from systems.planners.waypoint_sequencer import WaypointSequencer
+from systems.sensors.drawn_camera import DrawnCamera
 from systems.sensors.faults import Fault, FaultInjector
 from systems.sensors.imu import Imu, ImuParameters
 from systems.sensors.lidar import Lidar, LidarParameters
 from systems.sensors.rendered_camera import RenderedCamera
 from systems.sensors.wheel_encoders import WheelEncoders
+from systems.shell.marker_pose import ShellMarkerPose, shell_localizer
 
 # --- One of each, with inputs ---
 
@@ -114,6 +130,7 @@ class Case:
 
 TAG = family("DICT_4X4_50")
 CAMERA = PinholeCamera.from_focal_length(160, 120, 140.0)
+VIEW = ShellView(camera=CAMERA)  # over a shell, in no relation to the world
 # A camera in the world's origin that looks along x, and a marker 0.6 m before it.
 X_WC = RigidTransform(RollPitchYaw(-np.pi / 2, 0.0, -np.pi / 2), np.zeros(3))
 MAP = MarkerMap(TAG, 0.2, {7: Marker(7, spatial_pose(np.array([0.6, 0.0, np.pi - 0.5])), 0.2)})
@@ -168,6 +185,28 @@ def twin_positions(_: Path) -> Case:
     poses = (np.array([1.0, 2.0, 0.3]), np.array([1.0, 2.0, 0.4]))
     system = TwinPositions(plant=plant, models=["blue", "red"])
     return Case(system, {"blue": poses, "red": poses})
+
+
+def magnetic_adhesion(_: Path) -> Case:
+    plant = AddMultibodyPlantSceneGraph(DiagramBuilder(), 0.01)[0]
+    shell = add_shell(plant, ShellParameters(), "shell")
+    model = add_snailbot(plant, SnailBotParameters(), ShellParameters(), "robot")
+    plant.Finalize()
+    context = plant.CreateDefaultContext()
+    X_RB = stance(np.zeros(3), SnailBotParameters(), ShellParameters())
+    poses = []
+    for height in (0.0, 0.02):  # on the shell, off it
+        X_WB = X_RB @ RigidTransform([0.0, 0.0, height])
+        plant.SetFreeBodyPose(context, plant.GetBodyByName("base_link", model), X_WB)
+        poses.append(plant.get_body_poses_output_port().Eval(context))
+    system = MagneticAdhesion(
+        plant=plant,
+        model=model,
+        shell=shell,
+        wheel_radius=SnailBotParameters().wheel_radius,
+        shell_parameters=ShellParameters(),
+    )
+    return Case(system, {"body_poses": (poses[0], poses[1])})
 
 
 def recorder(folder: Path) -> Case:
@@ -244,6 +283,14 @@ def avoider(kind: type) -> Case:
     return Case(kind(), {**inputs, "scan": scans, "command": vector(0.2, 0.1)})
 
 
+def matches(stamp: float, distance: float) -> PointMatches:
+    """A shell that passes by under the camera of `VIEW`."""
+    y, x = np.mgrid[10:110:20, 10:150:20].astype(float)
+    before = np.stack([x.ravel(), y.ravel()], axis=1)
+    after = VIEW.turned(before, np.array([0.0, distance / VIEW.radius, 0.0]))
+    return PointMatches(stamp, stamp - 0.02, "camera", before, after)
+
+
 SQUARE = PlanarShapes(centres=[[0.0, 0.0]], headings=[0.0], sizes=[[0.2, 0.2]], radii=[0.0])
 QUERIES = (scene(0.0), scene(0.05))
 POSES = (RigidTransform(), RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [1.0, 2.0, 3.0]))
@@ -286,8 +333,23 @@ CASES: dict[type, Callable[[Path], Case]] = {
         Detector(detector=MarkerDetector(family=TAG), rate=20.0),
         {"image": (image(1.0), image(2.0))},
     ),
+    DrawnCamera: lambda _: Case(
+        DrawnCamera(
+            camera=CAMERA,
+            parent_frame=WORLD,
+            X_PC=X_WC,
+            rate=15.0,
+            markers=placed_markers(MAP, WORLD),
+            family=TAG,
+            effects=ImageEffects(exposure_samples=2, read_noise=1.0),
+        ),
+        {"query_object": QUERIES, "spatial_velocity": vector(0, 0, 1, 0, 0, 0)},
+    ),
     DwaAvoider: lambda _: avoider(DwaAvoider),
     EstimateViewer: viewer,
+    FlowProjector: lambda _: Case(
+        FlowProjector(camera=CAMERA), {"pose": (VIEW.X_SC, VIEW.X_SC @ POSES[1])}
+    ),
     GyroYaw: lambda _: Case(GyroYaw(num_samples=3), {"imu": vector(0.0, 0.0, 0.1, 0.0, 0.0, 9.81)}),
     Imu: lambda _: Case(
         Imu(parameters=ImuParameters(gyro_noise_density=0.01), p_BS=np.array([0.1, 0.0, 0.0])),
@@ -321,6 +383,8 @@ CASES: dict[type, Callable[[Path], Case]] = {
         ),
         {"detections": (detections(1.0), detections(2.0, shift=0.5))},
     ),
+    Madgwick: lambda _: Case(Madgwick(), {"imu": vector(0.1, 0.2, 0.3, 1.0, 2.0, 9.81)}),
+    MagneticAdhesion: magnetic_adhesion,
     MarkerProjector: lambda _: Case(
         MarkerProjector(
             camera=CAMERA,
@@ -343,6 +407,13 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "scan": (turn(0.0, 1.0), turn(0.1, 2.0)),
             "pose": vector(0.1, 0.2, 0.3),
             "covariance": vector(*(1e-4 * np.eye(3).ravel())),
+        },
+    ),
+    MeanFlow: lambda _: Case(
+        MeanFlow(view=VIEW),
+        {
+            "matches": (matches(1.0, 1e-4), matches(2.0, 2e-4)),
+            "imu": vector(0.1, 0.2, 0.3, 0.0, 0.0, 9.81),
         },
     ),
     MovingObstacles: lambda _: Case(
@@ -372,6 +443,14 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "marker_alternative": ESTIMATES,
         },
         nan_outputs=("nis",),
+    ),
+    PointTracker: lambda _: Case(
+        PointTracker(view=VIEW),
+        {
+            "image": (image(0.0), image(0.1)),
+            "imu": vector(0.1, 0.2, 0.3, 0.0, 0.0, 9.81),
+            "increment": (RotationIncrement(), RotationIncrement(0.0, -0.1, "", np.ones(3))),
+        },
     ),
     ProgressMonitor: lambda _: Case(
         ProgressMonitor(),
@@ -404,6 +483,36 @@ CASES: dict[type, Callable[[Path], Case]] = {
         {"command": vector(0.2, 0.1), "covariance": vector(*(0.01 * np.eye(3).ravel()))},
     ),
     SectorAvoider: lambda _: avoider(SectorAvoider),
+    SphereFlow: lambda _: Case(
+        SphereFlow(estimator=SphereFlowEstimator(view=VIEW)),
+        {"matches": (matches(1.0, 1e-4), matches(2.0, 2e-4))},
+    ),
+    ShellMarkerPose: lambda _: Case(
+        ShellMarkerPose(
+            localizer=shell_localizer(
+                marker_map=MAP,
+                camera=CAMERA,
+                X_BC=X_WC,
+                parameters=LocalizerParameters(max_reprojection=50.0),  # there is an alternative
+            ),
+            rate=20.0,
+        ),
+        {"detections": (detections(1.0), detections(2.0, shift=0.5))},
+    ),
+    ShellRoute: lambda _: Case(
+        ShellRoute(legs=[Leg(0.0, np.pi / 2, np.pi, 1.0)], radius=0.075), {"pose": POSES}
+    ),
+    ShellMotion: lambda _: Case(ShellMotion()),
+    ShellRover: lambda _: Case(ShellRover(radius=0.075), {"command": vector(0.03, 0.1)}),
+    ShellRule: lambda _: Case(
+        ShellRule(radius=0.075),
+        {
+            "marker_pose": ESTIMATES,
+            "flow": vector(0.03, 0.01),
+            "orientation": vector(1.0, 0.0, 0.0, 0.0),
+            "imu": vector(0.1, 0.2, 0.3, 0.0, 0.0, 9.81),
+        },
+    ),
     SurroundingsViewer: surroundings_viewer,
     TwinPositions: twin_positions,
     TwinState: lambda _: Case(
@@ -587,6 +696,13 @@ def simulate(case: Case, duration: float = 0.25) -> Context:
 def same(a: Any, b: Any) -> bool:
     if isinstance(a, RigidTransform):
         return a.IsExactlyEqualTo(b)
+    if isinstance(a, list):
+        return len(a) == len(b) and all(map(same, a, b))
+    if isinstance(a, ExternallyAppliedSpatialForce):
+        return all(
+            same(np.asarray(f(a)), np.asarray(f(b)))
+            for f in (lambda x: int(x.body_index), lambda x: x.F_Bq_W.get_coeffs())
+        )
     if isinstance(a, Message):
         return type(a) is type(b) and all(
             same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a)

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from tests.benchmarks import (
     bench_detector,
+    bench_drawing,
     bench_filter,
+    bench_flow,
     bench_lidar,
+    bench_madgwick,
     bench_planner,
     bench_pose,
     bench_run,
@@ -18,6 +21,9 @@ for title, module in (
     ("Lidar", bench_lidar),
     ("Planar filters", bench_filter),
     ("Planner, mapper and collision monitor", bench_planner),
-    ("Bundled run", bench_run),
+    ("Drawn camera", bench_drawing),
+    ("Flow over the shell", bench_flow),
+    ("Attitude filter", bench_madgwick),
+    ("Navigation robot", bench_run),
 ):
     show(title, module.rows())
