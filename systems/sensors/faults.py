@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort, State
 
-from systems.messages import CameraImage, Detections, Scan
+from systems.messages import CameraImage, Detections, PointMatches, Scan
 from systems.noise import NoiseStream, sample_index
 from systems.validation import require, require_non_negative, require_positive
 
@@ -26,6 +26,7 @@ _RATE = 100.0  # Hz, at which what came last is remembered
 _KINDS: dict[type, tuple[Kind, ...]] = {
     CameraImage: ("silent", "frozen", "garbled"),
     Detections: ("silent", "frozen", "nan", "garbled", "unknown_ids"),
+    PointMatches: ("silent", "frozen", "nan", "garbled"),
     Scan: ("silent", "frozen", "nan", "garbled"),
     int: ("frozen", "nan", "garbled"),  # a vector
 }
@@ -81,11 +82,17 @@ def spoil(value: Any, kind: Kind, held: Any, random: np.random.Generator) -> Any
     if isinstance(value, np.ndarray):
         return _spoil_vector(value, kind, held, random)
     if kind == "frozen":
-        return replace(held, stamp=value.stamp)
+        stamps = ("stamp", "previous_stamp")
+        return replace(
+            held, **{name: getattr(value, name) for name in stamps if hasattr(value, name)}
+        )
     if isinstance(value, CameraImage):
         return replace(value, data=random.integers(0, 256, value.data.shape, np.uint8))
     if isinstance(value, Scan):
         return replace(value, ranges=_spoil_vector(value.ranges, kind, held, random))
+    if isinstance(value, PointMatches):
+        points = _spoil_vector(value.current.ravel(), kind, held, random)
+        return replace(value, current=points.reshape(-1, 2))
     if kind == "unknown_ids":
         return replace(value, ids=_NO_SUCH_ID + np.arange(len(value)))
     corners = _spoil_vector(value.corners.ravel(), kind, held, random)

@@ -8,7 +8,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from systems.messages import CameraImage, Detections, Scan
+from systems.messages import CameraImage, Detections, PointMatches, Scan
 from systems.sensors.faults import Fault, FaultInjector
 
 RATE = 10.0  # Hz, of the signal
@@ -31,6 +31,13 @@ def detections(k: int) -> Detections:
 
 def image(k: int) -> CameraImage:
     return CameraImage(stamp=k / RATE, data=np.full((4, 6), k, np.uint8))
+
+
+def matches(k: int) -> PointMatches:
+    points = np.full((5, 2), 10.0 * k)
+    return PointMatches(
+        stamp=k / RATE, previous_stamp=(k - 1) / RATE, previous=points, current=points + 1.0
+    )
 
 
 class Source(LeafSystem):
@@ -95,19 +102,25 @@ def test_messages_before_and_after_are_the_very_same(kind: str) -> None:
         assert found[k].ids.tolist() == [3, 7]
 
 
-@pytest.mark.parametrize("make", [scan, detections, image])
+@pytest.mark.parametrize("make", [scan, detections, image, matches])
 def test_silence_leaves_the_last_message(make: Any) -> None:
     assert stamps(outputs(make, fault("silent"))) == [0, 1, 2, 2, 2, 2, 2, 7, 8, 9, 10, 11]
 
 
 @pytest.mark.parametrize(
     ("make", "content"),
-    [(scan, lambda m: m.ranges[0] - 1), (detections, lambda m: m.corners[0, 0, 0] / 10)],
+    [
+        (scan, lambda m: m.ranges[0] - 1),
+        (detections, lambda m: m.corners[0, 0, 0] / 10),
+        (matches, lambda m: m.previous[0, 0] / 10),
+    ],
 )
 def test_frozen_is_the_last_content_under_new_stamps(make: Any, content: Any) -> None:
     found = outputs(make, fault("frozen"))
     assert stamps(found) == list(range(12))
     assert [content(m) for m in found] == [0, 1, 2, 2, 2, 2, 2, 7, 8, 9, 10, 11]
+    if make is matches:
+        assert [round(m.previous_stamp * RATE) for m in found] == list(range(-1, 11))
 
 
 def test_nothing_yet_stays_nothing_yet() -> None:
@@ -132,6 +145,7 @@ def test_nan_is_in_every_measured_number_and_in_no_other() -> None:
         (scan, lambda m: m.ranges),
         (detections, lambda m: m.corners.ravel()),
         (image, lambda m: m.data.ravel()),
+        (matches, lambda m: m.current.ravel()),
     ],
 )
 def test_rubbish_is_new_each_time_and_the_same_for_one_seed(make: Any, content: Any) -> None:
