@@ -74,6 +74,7 @@ from systems.estimators.gyro_yaw import GyroYaw
 from systems.estimators.madgwick import Madgwick
 from systems.estimators.planar_ekf import PlanarEkf
 from systems.estimators.planar_kalman import PlanarKalmanFilter
+from systems.estimators.shell_ekf import ShellEkf
 from systems.estimators.shell_rule import ShellRule
 from systems.flow.lucas_kanade import PointTracker
 from systems.flow.mean_flow import MeanFlow
@@ -486,6 +487,16 @@ CASES: dict[type, Callable[[Path], Case]] = {
     SphereFlow: lambda _: Case(
         SphereFlow(estimator=SphereFlowEstimator(view=VIEW)),
         {"matches": (matches(1.0, 1e-4), matches(2.0, 2e-4))},
+    ),
+    ShellEkf: lambda _: Case(
+        ShellEkf(view=VIEW, marker_map=MAP),
+        {
+            "marker_pose": ESTIMATES,
+            "increment": (RotationIncrement(), RotationIncrement(0.0, -0.1, "", np.ones(3))),
+            "imu": vector(0.1, 0.2, 0.3, 0.0, 0.0, 9.81),
+            "reference_velocity": vector(0.0, 0.0, 0.1, 0.0, 0.0, 0.0),
+        },
+        nan_outputs=("nis",),
     ),
     ShellMarkerPose: lambda _: Case(
         ShellMarkerPose(

@@ -12,6 +12,7 @@ from tests.benchmarks import (
     bench_planner,
     bench_pose,
     bench_run,
+    bench_shell_ekf,
 )
 from tests.benchmarks.table import show
 
@@ -24,6 +25,7 @@ for title, module in (
     ("Drawn camera", bench_drawing),
     ("Flow over the shell", bench_flow),
     ("Attitude filter", bench_madgwick),
+    ("Filter of the pose on the shell", bench_shell_ekf),
     ("Navigation robot", bench_run),
 ):
     show(title, module.rows())
