@@ -71,7 +71,7 @@ class Wiring:
         self._signals = list(self.station.signals)
         self._sources: dict[str, str] = {}  # of signals that are not the station's
         self._logs: dict[str, VectorLogSink] = {}
-        self._watched: dict[str, OutputPort] = {}
+        self._watched: dict[str, OutputPort] = {}  # to look one up by name takes a millisecond
         if meshcat is not None:
             parameters = MeshcatVisualizerParams(
                 publish_period=1 / FRAME_RATE, role=Role.kIllustration, prefix="scene"
@@ -100,6 +100,8 @@ class Wiring:
 
     def has_output(self, name: str) -> bool:
         """Whether there is such an output port."""
+        if name in self._watched:
+            return True
         try:
             self.output(name)
         except ScenarioError:
@@ -117,7 +119,7 @@ class Wiring:
             name: as `output` takes it.
             context: of the whole diagram.
         """
-        if name not in self._watched:  # to look a port up by its name takes a millisecond
+        if name not in self._watched:
             self._watched[name] = self.output(name)
         port = self._watched[name]
         return port.Eval(port.get_system().GetMyContextFromRoot(context))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -78,9 +79,11 @@ def simulate(
         for name in RESULTS:
             (out / name).unlink(missing_ok=True)
         save_scenario(scenario, out / "scenario.yaml")
+    gc.freeze()  # diagram and modules stay: to look through them again and again costs 5 %
     try:
         outcome, context, wall = _advance(scenario, mission, realtime, progress)
     finally:
+        gc.unfreeze()
         if mission.recorder is not None:
             mission.recorder.close()
     report = {

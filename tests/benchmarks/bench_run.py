@@ -10,6 +10,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +20,7 @@ from pydrake.systems.framework import DiagramBuilder
 
 from diagrams.run import simulate
 from diagrams.scenario import load_scenario
-from plants.arena import add_arena
+from plants.arena import ArenaParameters, add_arena
 from plants.differential_drive import DifferentialDriveParameters, add_differential_drive
 from tests.benchmarks.table import Row, show
 
@@ -99,15 +100,15 @@ def _report(goal: Goal, changes: dict[str, str] | None = None) -> dict[str, Any]
 
 
 def plant_alone(time_step: float, seconds: float = 20.0) -> float:
-    """Returns how much faster than real time the plant is without the other blocks."""
-    scenario = load_scenario("navigation_open")
+    """Returns how much faster than real time the robot on bare ground is, without other blocks."""
+    markers = load_scenario("navigation_open").world.marker_map()
     config = MultibodyPlantConfig(
         time_step=time_step, discrete_contact_approximation="lagged",
         use_sampled_output_ports=False,
     )  # fmt: skip
     builder = DiagramBuilder()
     plant, _ = AddMultibodyPlant(config, builder)
-    add_arena(plant, scenario.world.arena, scenario.world.marker_map())
+    add_arena(plant, ArenaParameters(), replace(markers, markers={}))
     model = add_differential_drive(plant, DifferentialDriveParameters(), "robot")
     plant.Finalize()
     diagram = builder.Build()
