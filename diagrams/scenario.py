@@ -63,8 +63,8 @@ class Scenario:
         time_step: of the multibody plant, s.
         dynamics: `multibody` (wheels, contact, slip) or `kinematic` (the robots' kinematic twins).
         sight: what the cameras' detections come from: `rendered` pictures, pictures `drawn` without
-            shadows and textures (several times faster), or markers `projected` from the true poses
-            with pixel noise (hundreds of times faster).
+            shadows (a run takes two thirds of the time), or markers `projected` from the true poses
+            with pixel noise (hundreds of times faster than a picture).
         recording: a recording whose sensors are played back instead of simulated ones.
         record: what the run writes.
     """
