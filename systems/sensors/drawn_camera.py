@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import FrameId, QueryObject, Rgba, Role, SceneGraphInspector, Sphere
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort, ValueProducer
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 
 from systems.cameras import PinholeCamera
 from systems.drawing.boards import draw_board, marker_sheet, on_the_face
@@ -21,17 +21,13 @@ from systems.drawing.layers import Drawing, paint
 from systems.drawing.order import paint_order
 from systems.drawing.shells import DrawnShell, draw_shell
 from systems.drawing.solids import Polyhedron, draw_solid, polyhedron, view_planes
-from systems.image_effects import ImageEffects, expose
+from systems.image_effects import ImageEffects
 from systems.markers.family import Family
-from systems.markers.pnp import rotation_from_vector
 from systems.markers.projector import PlacedMarker
-from systems.messages import CameraImage
-from systems.noise import NoiseStream
-from systems.sensors.sampled import SampledSensor
+from systems.sensors.mounted_camera import Image, MountedCamera
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 # What Drake's renderer gives shapes without a colour of their own.
 _DEFAULT_COLOUR = Rgba(0.9, 0.9, 0.9, 1.0)
@@ -92,7 +88,7 @@ class _Workshop:
         return _Workshop(self.solids)
 
 
-class DrawnCamera(SampledSensor):
+class DrawnCamera(MountedCamera):
     """Draws what a camera fixed to a body sees, then does what lens and sensor do to it.
 
     .. pydrake_system::
@@ -164,10 +160,17 @@ class DrawnCamera(SampledSensor):
         solids: Role | None = Role.kPerception,
         transparent_frames: Collection[FrameId] = (),
     ) -> None:
-        super().__init__()
-        near, far = clipping
-        sound = 0 < near < far and bool(np.isfinite(far))
-        require(sound, "clipping", clipping, "two distances in metres, 0 < near < far")
+        super().__init__(
+            parent_frame=parent_frame,
+            X_PC=X_PC,
+            rate=rate,
+            latency=latency,
+            effects=effects,
+            clipping=clipping,
+            seed=seed,
+            name=name,
+            frame_id=frame_id,
+        )
         require(not markers or family is not None, "family", family, "that of the markers")
         for marker in markers:
             assert family is not None
@@ -180,13 +183,9 @@ class DrawnCamera(SampledSensor):
             "invertible along the picture's border",
         )
         self._camera = camera
-        self._parent = parent_frame
-        self._X_PC = X_PC
-        self._far = far
+        self._far = clipping[1]
         self._shells = tuple(shells)
         self._parameters = parameters or DrawingParameters()
-        self._effects = effects or ImageEffects()
-        self._frame_id = frame_id
         self._role = solids
         self._transparent = frozenset(transparent_frames)
         margin = self._parameters.margin
@@ -195,67 +194,24 @@ class DrawnCamera(SampledSensor):
             on_the_face(sheet.start, m.size, m.X_FM.GetAsMatrix34()) for m, sheet in self._boards
         ]
         self._board_balls = BoundingBalls([m.frame for m, _ in self._boards], corners)
-        self._noise = NoiseStream(self, seed=seed, name=name)
         no_calc: Any = ValueProducer.NoopCalc
         self._workshop_entry = self.DeclareCacheEntry(
             "solids of the scene, and memory",
             ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=no_calc),
             {LeafSystem.nothing_ticket()},
         )
-        self._query_input = self.DeclareAbstractInputPort(
-            "query_object", AbstractValue.Make(QueryObject())
-        )
-        self._velocity_input = self.DeclareVectorInputPort("spatial_velocity", 6)
-        self._image_output = self._declare_sampling(
-            name="image", rate=rate, latency=latency, nothing=CameraImage(frame_id=frame_id)
-        )
 
-    def query_object_input_port(self) -> InputPort:
-        """Returns the port of the geometry."""
-        return self._query_input
-
-    def spatial_velocity_input_port(self) -> InputPort:
-        """Returns the port of the body's velocity."""
-        return self._velocity_input
-
-    def image_output_port(self) -> OutputPort:
-        """Returns the port of the pictures."""
-        return self._image_output
-
-    def _measure(self, context: Context, stamp: float, index: int) -> CameraImage:
-        query: Any = self._query_input.Eval(context)
+    def _picture(self, context: Context, query: QueryObject, poses: list[RigidTransform]) -> Image:
         X_WP = query.GetPoseInWorld(self._parent)
         workshop = self._workshop(context, query)
-        total: NDArray[np.float32] | None = None
-        placements = self._placements(context, X_WP)
-        for X_WC in placements:
-            picture = self._draw(query, X_WC, workshop)
-            total = picture if total is None else total + picture
-        assert total is not None
-        if len(placements) > 1:
-            total /= len(placements)
+        total = self._draw(query, X_WP @ poses[0], workshop)
+        for X_PC in poses[1:]:
+            total += self._draw(query, X_WP @ X_PC, workshop)
+        if len(poses) > 1:
+            total /= len(poses)
         total += 0.5  # to the nearest: the cast cuts off
-        image = np.clip(total, 0.0, 255.0, out=total).astype(np.uint8)
-        if self._effects.grey:
-            image = image[:, :, 0]
-        image = expose(image, self._effects, self._noise.generator(context, index))
-        return CameraImage(stamp=stamp, frame_id=self._frame_id, data=image)
-
-    def _placements(self, context: Context, X_WP: RigidTransform) -> list[RigidTransform]:
-        """Returns poses of the optical frame during an exposure whose middle is now."""
-        n = self._effects.exposure_samples
-        if n == 1:
-            return [X_WP @ self._X_PC]
-        velocity = self._velocity_input.Eval(context)
-        R_PW = X_WP.rotation().matrix().T
-        w_P, v_P = R_PW @ velocity[:3], R_PW @ velocity[3:]
-        times = self._effects.exposure * ((np.arange(n) + 0.5) / n - 0.5)
-        return [
-            X_WP
-            @ RigidTransform(RotationMatrix(rotation_from_vector(w_P * dt)), v_P * dt)
-            @ self._X_PC
-            for dt in times
-        ]
+        image: Image = np.clip(total, 0.0, 255.0, out=total).astype(np.uint8)
+        return image[:, :, 0] if self._effects.grey else image
 
     def _draw(
         self, query: QueryObject, X_WC: RigidTransform, workshop: _Workshop

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 import cv2
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
 from pydrake.geometry import (
     ClippingRange,
     ColorRenderCamera,
@@ -15,21 +11,15 @@ from pydrake.geometry import (
     QueryObject,
     RenderCameraCore,
 )
-from pydrake.math import RigidTransform, RotationMatrix
-from pydrake.systems.framework import Context, InputPort, OutputPort
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context
 
 from systems.cameras import PinholeCamera
-from systems.image_effects import ImageEffects, Lens, expose, linear_light
-from systems.markers.pnp import rotation_from_vector
-from systems.messages import CameraImage
-from systems.noise import NoiseStream
-from systems.sensors.sampled import SampledSensor
-from systems.validation import require
-
-Image = NDArray[np.uint8]
+from systems.image_effects import ImageEffects, Lens, linear_light
+from systems.sensors.mounted_camera import Image, MountedCamera
 
 
-class RenderedCamera(SampledSensor):
+class RenderedCamera(MountedCamera):
     """Renders what a camera fixed to a body sees, then does what lens and sensor do to it.
 
     .. pydrake_system::
@@ -84,66 +74,31 @@ class RenderedCamera(SampledSensor):
         name: str = "camera",
         frame_id: str = "camera",
     ) -> None:
-        super().__init__()
-        near, far = clipping
-        sound = 0 < near < far and math.isfinite(far)
-        require(sound, "clipping", clipping, "two distances in metres, 0 < near < far")
-        self._effects = effects or ImageEffects()
+        super().__init__(
+            parent_frame=parent_frame,
+            X_PC=X_PC,
+            rate=rate,
+            latency=latency,
+            effects=effects,
+            clipping=clipping,
+            seed=seed,
+            name=name,
+            frame_id=frame_id,
+        )
         self._lens = Lens(camera, self._effects.supersampling)
-        self._parent = parent_frame
-        self._X_PC = X_PC
-        self._frame_id = frame_id
         core = RenderCameraCore(
             renderer, self._lens.ideal.to_drake(), ClippingRange(*clipping), RigidTransform()
         )
         self._render_camera = ColorRenderCamera(core, False)
-        self._noise = NoiseStream(self, seed=seed, name=name)
-        self._query_input = self.DeclareAbstractInputPort(
-            "query_object", AbstractValue.Make(QueryObject())
-        )
-        self._velocity_input = self.DeclareVectorInputPort("spatial_velocity", 6)
-        self._image_output = self._declare_sampling(
-            name="image", rate=rate, latency=latency, nothing=CameraImage(frame_id=frame_id)
-        )
 
-    def query_object_input_port(self) -> InputPort:
-        """Returns the port of the geometry."""
-        return self._query_input
-
-    def spatial_velocity_input_port(self) -> InputPort:
-        """Returns the port of the body's velocity."""
-        return self._velocity_input
-
-    def image_output_port(self) -> OutputPort:
-        """Returns the port of the pictures."""
-        return self._image_output
-
-    def _measure(self, context: Context, stamp: float, index: int) -> CameraImage:
-        query = self._query_input.Eval(context)
-        if self._effects.exposure_samples > 1:
-            image = self._moving(context, query)
-        else:
-            image = self._render(query, self._X_PC)
-        image = expose(image, self._effects, self._noise.generator(context, index))
-        return CameraImage(stamp=stamp, frame_id=self._frame_id, data=image)
+    def _picture(self, context: Context, query: QueryObject, poses: list[RigidTransform]) -> Image:
+        del context
+        if len(poses) == 1:
+            return self._render(query, poses[0])
+        total = sum(self._render(query, X_PC).astype(np.float32) for X_PC in poses)
+        return np.rint(total / len(poses)).astype(np.uint8)
 
     def _render(self, query: QueryObject, X_PC: RigidTransform) -> Image:
         rgba = query.RenderColorImage(self._render_camera, self._parent, X_PC).data
         code = cv2.COLOR_RGBA2GRAY if self._effects.grey else cv2.COLOR_RGBA2RGB
         return self._lens(linear_light(cv2.cvtColor(rgba, code)))
-
-    def _moving(self, context: Context, query: QueryObject) -> Image:
-        """Averages pictures over an exposure whose middle is now."""
-        velocity = self._velocity_input.Eval(context)
-        R_WP = query.GetPoseInWorld(self._parent).rotation().matrix()
-        w_P, v_P = R_WP.T @ velocity[:3], R_WP.T @ velocity[3:]
-        n = self._effects.exposure_samples
-        total: NDArray[np.float32] | None = None
-        for k in range(n):
-            dt = self._effects.exposure * ((k + 0.5) / n - 0.5)
-            # The body's pose dt from now, in the body now.
-            X_PP = RigidTransform(RotationMatrix(rotation_from_vector(w_P * dt)), v_P * dt)
-            image = self._render(query, X_PP.multiply(self._X_PC)).astype(np.float32)
-            total = image if total is None else total + image
-        assert total is not None
-        return np.rint(total / n).astype(np.uint8)
