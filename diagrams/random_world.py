@@ -95,7 +95,7 @@ def _plain(room: RandomArena) -> dict[str, Any]:
 
 
 def plain_markers(markers: MarkerMap) -> dict[str, Any]:
-    """Returns upright markers as a scenario lists them (see `diagrams.station.TagList`)."""
+    """Returns upright markers as a scenario lists them (see `diagrams.world.TagList`)."""
     tags = []
     for marker in markers:
         normal = marker.X_WM.rotation().matrix()[:, 0]

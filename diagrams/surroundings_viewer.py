@@ -1,7 +1,7 @@
 """What Meshcat shows of how the robot sees its surroundings: scan, sectors, path, occupancy grid.
 
 The replay keeps transforms and properties, not changes of shape. So everything is drawn with pools
-of small objects that are moved; what is not needed waits below the ground.
+of small objects that are moved; what is not needed is hidden.
 """
 
 from __future__ import annotations
