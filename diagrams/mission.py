@@ -24,7 +24,7 @@ from diagrams.channels import Signal
 from diagrams.scenario import Scenario
 from diagrams.schema import ScenarioError
 from diagrams.station import RobotParameters, Station
-from diagrams.world import WorldParameters
+from diagrams.world import World
 from systems.io.bag import BagReader, BagWriter
 from systems.io.recorder import Recorder
 from systems.validation import nearest
@@ -49,7 +49,7 @@ class Wiring:
         self,
         scenario: Scenario,
         *,
-        world: WorldParameters,
+        world: World,
         robots: dict[str, RobotParameters],
         meshcat: Meshcat | None,
     ) -> None:
@@ -215,13 +215,9 @@ class Wiring:
         )
 
 
-def _look_at(meshcat: Meshcat, world: WorldParameters) -> None:
-    """Points Meshcat's camera at the arena, from the south and above, without axes and grid."""
-    walls = world.arena.walls
-    ends = np.array([end for wall in walls for end in (wall.start, wall.end)] or [[-1, -1], [1, 1]])
-    middle, extent = (ends.max(axis=0) + ends.min(axis=0)) / 2, np.ptp(ends, axis=0).max()
-    eye = [middle[0], middle[1] - 0.55 * extent, 0.75 * extent]
-    meshcat.SetCameraPose(eye, [*middle, 0.0])
+def _look_at(meshcat: Meshcat, world: World) -> None:
+    """Points Meshcat's camera at the world, without axes and grid."""
+    meshcat.SetCameraPose(*world.view())
     for name in ("/Grid", "/Axes"):
         meshcat.SetProperty(name, "visible", False)
 

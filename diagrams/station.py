@@ -27,10 +27,8 @@ from pydrake.systems.framework import Diagram, DiagramBuilder, InputPort, Output
 
 from diagrams.channels import Signal
 from diagrams.schema import ScenarioError
-from diagrams.surroundings import add_clearance, add_motion, let_wait, show_twins
 from diagrams.tables import Choice, Table
-from diagrams.world import WorldParameters
-from plants.arena import add_arena
+from diagrams.world import World
 from plants.lighting import daylight
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.layout import MarkerMap
@@ -176,7 +174,7 @@ class StationBuilder:
         end_time: time of the last message that is played, s.
     """
 
-    world: WorldParameters
+    world: World
     marker_map: MarkerMap
     true_markers: MarkerMap
     seed: int = 0
@@ -208,7 +206,7 @@ class StationBuilder:
             self.plant.RegisterAsSourceForSceneGraph(self.scene_graph)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")
-        add_arena(self.plant, self.world.arena, self.true_markers)
+        self.world.add_models(self)
 
     @property
     def simulated(self) -> bool:
@@ -313,7 +311,7 @@ class Station(Diagram):
     def __init__(
         self,
         *,
-        world: WorldParameters,
+        world: World,
         robots: dict[str, RobotParameters],
         seed: int = 0,
         sight: str = "rendered",
@@ -339,7 +337,7 @@ class Station(Diagram):
         station = StationBuilder(
             world=world,
             marker_map=world.marker_map(),
-            true_markers=world.true_markers(),
+            true_markers=world.true_markers(seed),
             seed=seed,
             sight=sight,
             time_step=time_step,
@@ -349,15 +347,17 @@ class Station(Diagram):
         )
         bodies = {
             name: Robot(
-                name, parameters.body.build(), parameters.start.pose(), parameters.drive.build()
+                name,
+                parameters.body.build(**world.resources()),
+                parameters.start.pose(),
+                parameters.drive.build(),
             )
             for name, parameters in robots.items()
         }
         if station.simulated:
             for robot in bodies.values():
-                robot.body.add_model(station.plant, robot)
+                robot.body.add_model(station, robot)
         station.plant.Finalize()
-        moving = add_motion(station, len(bodies) if station.simulated else 0)
         for name, robot in bodies.items():
             if station.simulated:
                 robot.body.add_state(station, robot)
@@ -366,14 +366,10 @@ class Station(Diagram):
             robot.drive.add(station, robot)
             for device, sensor in robots[name].sensors.items():
                 sensor.build().add(station, robot, device)
-            add_clearance(station, robot, moving)
-        if station.simulated:
-            let_wait(station, list(bodies.values()))
+        world.add_blocks(station, list(bodies.values()))
         for port in station.faults:
             known = [signal.port for signal in station.signals]
             raise ScenarioError(f"faults: there is no signal {port}; {nearest(port, known)}")
-        if station.dynamics == "kinematic" and station.plant.num_positions() > 0:
-            show_twins(station, list(bodies.values()) if station.simulated else [])
         station.builder.ExportOutput(
             station.scene_graph.get_query_output_port(), "scene.query_object"
         )

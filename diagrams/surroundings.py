@@ -14,6 +14,7 @@ from pydrake.systems.primitives import Adder, AffineSystem, MatrixGain, Multiple
 from pydrake.systems.rendering import MultibodyPositionToGeometryPose
 
 from diagrams.channels import Signal
+from plants.arena import ArenaParameters
 from plants.body_state import TwinPositions
 from plants.clearance import ClearanceMonitor
 from plants.footprint import footprint
@@ -24,17 +25,18 @@ if TYPE_CHECKING:
     from diagrams.station import Robot, StationBuilder
 
 
-def add_motion(station: StationBuilder, robots: int) -> OutputPort | None:
+def add_motion(station: StationBuilder, arena: ArenaParameters, robots: int) -> OutputPort | None:
     """Makes the moving obstacles move in a multibody plant.
 
     Args:
         station: its plant is finalized.
+        arena: what stands and moves there.
         robots: how many there are, for whom the obstacles may wait (see `let_wait`).
 
     Returns:
         The port of their true positions, [x, y, ...] (m); None when nothing moves.
     """
-    moving = station.world.arena.moving
+    moving = arena.moving
     if not moving:
         return None
     motion = station.add(MovingObstacles(cylinders=moving, robots=robots), "moving")
@@ -58,14 +60,15 @@ def add_motion(station: StationBuilder, robots: int) -> OutputPort | None:
     return positions.get_output_port()
 
 
-def let_wait(station: StationBuilder, robots: list[Robot]) -> None:
+def let_wait(station: StationBuilder, arena: ArenaParameters, robots: list[Robot]) -> None:
     """Shows moving obstacles where the robots are, if there are such obstacles.
 
     Args:
         station: with `add_motion` done.
+        arena: what stands and moves there.
         robots: all of them, with their states.
     """
-    if not station.world.arena.moving:
+    if not arena.moving:
         return
     poses = station.add(Multiplexer([3] * len(robots)), "robot_poses")
     for k, robot in enumerate(robots):
@@ -74,11 +77,12 @@ def let_wait(station: StationBuilder, robots: list[Robot]) -> None:
     station.connect(poses.get_output_port(), motion.GetInputPort("robots"))
 
 
-def show_twins(station: StationBuilder, robots: list[Robot]) -> None:
+def show_twins(station: StationBuilder, arena: ArenaParameters, robots: list[Robot]) -> None:
     """Moves the geometry of kinematic twins and of moving obstacles.
 
     Args:
         station: whose plant is a model only, not simulated.
+        arena: what stands and moves there.
         robots: those that have a twin.
     """
     plant = station.plant
@@ -93,7 +97,7 @@ def show_twins(station: StationBuilder, robots: list[Robot]) -> None:
     for robot in robots:
         station.connect(robot.twin.pose_output_port(), twins.GetInputPort(robot.name))
     positions = twins.get_output_port()
-    if station.world.arena.moving:
+    if arena.moving:
         positions = _with_moving(station, positions)
     station.connect(positions, to_geometry.get_input_port())
 
@@ -115,11 +119,14 @@ def _with_moving(station: StationBuilder, positions: OutputPort) -> OutputPort:
     return both.get_output_port()
 
 
-def add_clearance(station: StationBuilder, robot: Robot, moving: OutputPort | None) -> None:
+def add_clearance(
+    station: StationBuilder, arena: ArenaParameters, robot: Robot, moving: OutputPort | None
+) -> None:
     """Exports the truth about a robot's clearance and contacts, or plays it back if recorded.
 
     Args:
         station: its plant is finalized.
+        arena: what stands and moves there.
         robot: whose truth it is.
         moving: port of the moving obstacles' positions, if any.
     """
@@ -130,7 +137,6 @@ def add_clearance(station: StationBuilder, robot: Robot, moving: OutputPort | No
             if port is not None:
                 station.export_output(port, signal.port, signal)
         return
-    arena = station.world.arena
     monitor = station.add(
         ClearanceMonitor(
             footprint=footprint(station.plant, station.scene_graph.model_inspector(), robot.model),

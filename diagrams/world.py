@@ -1,19 +1,62 @@
-"""What a scenario says of the world around the robots: markers and obstacles."""
+"""What a scenario says of the world around the robots: what a world is, and the arena."""
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RollPitchYaw
 
 from diagrams.schema import File, ScenarioError, file_path
-from plants.arena import ArenaParameters
+from diagrams.surroundings import add_clearance, add_motion, let_wait, show_twins
+from plants.arena import ArenaParameters, add_arena
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap, load_map
 from systems.validation import require, require_non_negative, require_positive
+
+if TYPE_CHECKING:
+    from diagrams.station import Robot, StationBuilder
+
+
+class World(ABC):
+    """What stands around the robots: a station is built in it."""
+
+    @abstractmethod
+    def marker_map(self) -> MarkerMap:
+        """Returns the markers as the robots believe them to be."""
+
+    @abstractmethod
+    def true_markers(self, seed: int) -> MarkerMap:
+        """Returns the markers as they are.
+
+        Args:
+            seed: of the scenario.
+        """
+
+    @abstractmethod
+    def view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns where Meshcat's camera is and what it looks at, (3,) m each."""
+
+    @abstractmethod
+    def add_models(self, station: StationBuilder) -> None:
+        """Adds what stands around to the plant, before any robot."""
+
+    @abstractmethod
+    def add_blocks(self, station: StationBuilder, robots: list[Robot]) -> None:
+        """Adds what moves in the world, and the truth about robots in it.
+
+        Args:
+            station: its plant is finalized, its robots have their devices.
+            robots: all of them.
+        """
+
+    def resources(self) -> dict[str, Any]:
+        """Returns what the bodies of robots take from the world, by the argument's name."""
+        return {}
 
 
 @dataclass
@@ -96,8 +139,8 @@ class MovedMarker:
 
 
 @dataclass
-class WorldParameters:
-    """What stands around the robots.
+class WorldParameters(World):
+    """An arena: a flat ground with obstacles and upright markers.
 
     In a scenario it may come from the seed instead: see `diagrams.random_world`.
 
@@ -118,12 +161,13 @@ class WorldParameters:
             return self.markers.to_map()
         return load_map(file_path(self.markers, "maps"))
 
-    def true_markers(self) -> MarkerMap:
+    def true_markers(self, seed: int = 0) -> MarkerMap:
         """Returns the markers where they are.
 
         Raises:
             ScenarioError: a marker that was moved is not in the map.
         """
+        del seed
         believed = self.marker_map()
         markers = dict(believed.markers)
         for moved in self.moved_markers:
@@ -134,3 +178,25 @@ class WorldParameters:
             shift = RigidTransform([float(d) for d in moved.by])
             markers[moved.id] = replace(marker, X_WM=shift @ marker.X_WM)
         return replace(believed, markers=markers)
+
+    def view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns a place to the south of the arena and above, and its middle."""
+        walls = self.arena.walls
+        ends = np.array([e for wall in walls for e in (wall.start, wall.end)] or [[-1, -1], [1, 1]])
+        middle, extent = (ends.max(axis=0) + ends.min(axis=0)) / 2, np.ptp(ends, axis=0).max()
+        eye = np.array([middle[0], middle[1] - 0.55 * extent, 0.75 * extent])
+        return eye, np.array([*middle, 0.0])
+
+    def add_models(self, station: StationBuilder) -> None:
+        """Adds ground, obstacles and marker boards."""
+        add_arena(station.plant, self.arena, station.true_markers)
+
+    def add_blocks(self, station: StationBuilder, robots: list[Robot]) -> None:
+        """Adds moving obstacles, the truth about clearance and contacts, and kinematic twins."""
+        moving = add_motion(station, self.arena, len(robots) if station.simulated else 0)
+        for robot in robots:
+            add_clearance(station, self.arena, robot, moving)
+        if station.simulated:
+            let_wait(station, self.arena, robots)
+        if station.dynamics == "kinematic" and station.plant.num_positions() > 0:
+            show_twins(station, self.arena, robots if station.simulated else [])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from pydrake.multibody.plant import MultibodyPlant
 from pydrake.systems.framework import BasicVector, OutputPort
 from pydrake.systems.primitives import Demultiplexer, Integrator, MatrixGain, PassThrough
 
@@ -48,11 +47,12 @@ class DifferentialDriveBody:
         """Returns [right, left] (rad/s) of a command [v, omega]."""
         return wheel_speeds(command, self.parameters)
 
-    def add_model(self, plant: MultibodyPlant, robot: Robot) -> None:
+    def add_model(self, station: StationBuilder, robot: Robot) -> None:
         """Adds the robot to the plant, at its start.
 
         Its wheels are turned by the `motor` (a `MotorModel`) of its drive, else by speed servos.
         """
+        plant = station.plant
         motor = getattr(robot.drive, "motor", None)
         robot.model = add_differential_drive(plant, self.parameters, robot.name, motor)
         body = plant.GetBodyByName("base_link", robot.model)
