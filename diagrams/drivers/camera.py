@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydrake.common.value import AbstractValue
+from pydrake.geometry import FrameId
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import OutputPort
 from pydrake.systems.primitives import ConstantValueSource
@@ -16,10 +18,16 @@ from diagrams.channels import detections_signal, image_signal, topic_of
 from diagrams.schema import File, ScenarioError, file_path
 from diagrams.station import RENDERER, Robot, StationBuilder
 from systems.cameras import PinholeCamera, load_camera
+from systems.drawing.shells import DrawnShell
 from systems.image_effects import ImageEffects
 from systems.io.ros_vision import camera_to_ros, image_from_ros
 from systems.markers.detector import Detector, DetectorParameters, MarkerDetector
-from systems.markers.projector import MarkerProjector, ProjectorParameters, placed_markers
+from systems.markers.projector import (
+    MarkerProjector,
+    PlacedMarker,
+    ProjectorParameters,
+    placed_markers,
+)
 from systems.messages import CameraImage, Health
 from systems.sensors.drawn_camera import DrawnCamera
 from systems.sensors.rendered_camera import RenderedCamera
@@ -29,9 +37,28 @@ from systems.validation import require, require_non_negative, require_positive
 R_FORWARD_OPTICAL = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
 
 
-@dataclass
-class Camera:
-    """A calibrated camera fixed to the robot.
+@dataclass(frozen=True, eq=False)
+class View:
+    """What a simulated camera sees.
+
+    Attributes:
+        X_BC: true pose of the optical frame in base_link.
+        markers: boards, flat or bent.
+        own_frames: the robot's own geometry, which hides nothing.
+        shells: what is drawn in place of flat boards, if anything.
+        clipping: nearest and farthest distance that is seen, m.
+    """
+
+    X_BC: RigidTransform
+    markers: list[PlacedMarker]
+    own_frames: list[FrameId]
+    shells: list[DrawnShell] = field(default_factory=list)
+    clipping: tuple[float, float] = (0.01, 50.0)
+
+
+@dataclass(kw_only=True)
+class CameraDriver(ABC):
+    """What all cameras on robots have; where one is mounted, and what it sees, its own class says.
 
     Ports of the station: `{robot}.{device}.image` (CameraImage; of size 0 when there are none, as
     under projected sight), `{robot}.{device}.detections` (Detections), `{robot}.{device}.health`.
@@ -40,10 +67,8 @@ class Camera:
         calibration: camera file (bundled, or beside the scenario).
         rate: pictures a second, Hz.
         latency: from the middle of the exposure to the arrival of the picture, s.
-        position: [x, y, z] of the optical centre in base_link, m.
-        rpy_deg: roll, pitch, yaw of the camera; zeros look forward, positive pitch looks down.
         sight: `rendered`, `drawn` or `projected`; left out, the scenario's.
-        effects: what lens and sensor do to rendered pictures.
+        effects: what lens and sensor do to pictures.
         detector: how markers are found in pictures.
         projector: how markers are found without pictures.
     """
@@ -51,8 +76,6 @@ class Camera:
     calibration: Annotated[str, File("cameras")]
     rate: float = 15.0
     latency: float = 0.0
-    position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.1])
-    rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
     sight: Literal["rendered", "drawn", "projected"] | None = None
     effects: ImageEffects = field(default_factory=ImageEffects)
     detector: DetectorParameters = field(default_factory=DetectorParameters)
@@ -61,20 +84,18 @@ class Camera:
     def __post_init__(self) -> None:
         require_positive(rate=self.rate)
         require_non_negative(latency=self.latency)
-        for name in ("position", "rpy_deg"):
-            value = getattr(self, name)
-            require(
-                len(value) == 3 and bool(np.isfinite(value).all()), name, value, "three numbers"
-            )
 
     def model(self) -> PinholeCamera:
         """Returns the calibrated camera."""
         return load_camera(file_path(self.calibration, "cameras"))
 
-    def mounting(self) -> RigidTransform:
-        """Returns `X_BC`, the pose of the optical frame in base_link."""
-        R_BMount = RollPitchYaw(*(math.radians(a) for a in self.rpy_deg)).ToRotationMatrix()
-        return RigidTransform(R_BMount.multiply(R_FORWARD_OPTICAL), self.position)
+    @abstractmethod
+    def planned_mounting(self, robot: Robot) -> RigidTransform:
+        """Returns `X_BC`, the pose of the optical frame in base_link, as the robot knows it."""
+
+    @abstractmethod
+    def view(self, station: StationBuilder, robot: Robot) -> View:
+        """Returns what there is to see, and from where."""
 
     def add(self, station: StationBuilder, robot: Robot, device: str) -> None:
         """Wires the camera into a station."""
@@ -85,7 +106,7 @@ class Camera:
             "sensor_msgs/msg/CameraInfo",
             camera_to_ros(camera, stamp=0.0, frame_id=frame_id),
         )
-        station.mountings[frame_id] = (robot.name, self.mounting())
+        station.mountings[frame_id] = (robot.name, self.planned_mounting(robot))
         images, found = image_signal(name, self.rate), detections_signal(name, self.rate)
         image, detections = self._sources(station, robot, name, camera)
         if image is None:
@@ -147,24 +168,26 @@ class Camera:
             if image is not None:
                 return image, None
             return None, station.play(detections_signal(name, self.rate))
-        frame_id = name.replace(".", "/")
+        view = self.view(station, robot)
+        shared: dict[str, Any] = {
+            "camera": camera,
+            "parent_frame": robot.frame_id,
+            "X_PC": view.X_BC,
+            "rate": self.rate,
+            "latency": self.latency,
+            "seed": station.seed,
+            "name": name,
+            "frame_id": name.replace(".", "/"),
+        }
         sight = self.sight or station.sight
-        markers = placed_markers(station.true_markers, station.scene_graph.world_frame_id())
         if sight == "projected":
             projector = station.add(
                 MarkerProjector(
-                    camera=camera,
-                    parent_frame=robot.frame_id,
-                    X_PC=self.mounting(),
-                    markers=markers,
+                    markers=view.markers,
                     family=station.marker_map.family,
                     parameters=self.projector,
-                    rate=self.rate,
-                    latency=self.latency,
-                    seed=station.seed,
-                    name=name,
-                    frame_id=frame_id,
-                    transparent_frames=[robot.frame_id],
+                    transparent_frames=view.own_frames,
+                    **shared,
                 ),
                 f"{name}.projector",
             )
@@ -172,20 +195,16 @@ class Camera:
                 station.scene_graph.get_query_output_port(), projector.query_object_input_port()
             )
             return None, projector.detections_output_port()
-        shared: dict[str, Any] = {
-            "camera": camera,
-            "parent_frame": robot.frame_id,
-            "X_PC": self.mounting(),
-            "rate": self.rate,
-            "latency": self.latency,
-            "effects": self.effects,
-            "seed": station.seed,
-            "name": name,
-            "frame_id": frame_id,
-        }
+        shared |= {"effects": self.effects, "clipping": view.clipping}
         sensor: DrawnCamera | RenderedCamera
         if sight == "drawn":
-            sensor = DrawnCamera(markers=markers, family=station.marker_map.family, **shared)
+            sensor = DrawnCamera(
+                markers=() if view.shells else view.markers,
+                family=station.marker_map.family,
+                shells=view.shells,
+                transparent_frames=view.own_frames if view.shells else (),
+                **shared,
+            )
         else:
             station.need_renderer()
             try:
@@ -200,3 +219,43 @@ class Camera:
             robot.state.GetOutputPort("spatial_velocity"), sensor.spatial_velocity_input_port()
         )
         return sensor.image_output_port(), None
+
+
+@dataclass(kw_only=True)
+class Camera(CameraDriver):
+    """A calibrated camera fixed to the robot, anywhere; see `CameraDriver`.
+
+    Attributes:
+        position: [x, y, z] of the optical centre in base_link, m.
+        rpy_deg: roll, pitch, yaw of the camera; zeros look forward, positive pitch looks down.
+    """
+
+    position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.1])
+    rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("position", "rpy_deg"):
+            value = getattr(self, name)
+            require(
+                len(value) == 3 and bool(np.isfinite(value).all()), name, value, "three numbers"
+            )
+
+    def mounting(self) -> RigidTransform:
+        """Returns `X_BC`, the pose of the optical frame in base_link."""
+        R_BMount = RollPitchYaw(*(math.radians(a) for a in self.rpy_deg)).ToRotationMatrix()
+        return RigidTransform(R_BMount.multiply(R_FORWARD_OPTICAL), self.position)
+
+    def planned_mounting(self, robot: Robot) -> RigidTransform:
+        """Returns `X_BC`."""
+        del robot
+        return self.mounting()
+
+    def view(self, station: StationBuilder, robot: Robot) -> View:
+        """Returns the boards of the world."""
+        world = station.scene_graph.world_frame_id()
+        return View(
+            X_BC=self.mounting(),
+            markers=placed_markers(station.true_markers, world),
+            own_frames=[robot.frame_id],
+        )
