@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import AddContactMaterial, ProximityProperties, Shape, Sphere
+from pydrake.geometry import AddContactMaterial, ProximityProperties, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
@@ -92,7 +92,7 @@ def add_shell(
     name: str,
     parent: Frame | None = None,
     X_PR: RigidTransform | None = None,
-    surface: Shape | None = None,
+    plain: bool = True,
 ) -> ModelInstanceIndex:
     """Adds a shell that is fixed to the world, or to a robot which carries it.
 
@@ -102,13 +102,14 @@ def add_shell(
         name: of the model instance; its body is `shell`.
         parent: what it is fixed to; None for the world.
         X_PR: its pose there; None for the parent's own.
-        surface: what cameras see in place of a plain sphere, in frame R: a textured mesh.
+        plain: whether it looks like a plain sphere; if not, `plants.shell_surface` is to give it
+            its looks.
 
     Returns:
         The model instance.
     """
     model = plant.AddModelInstance(name)
-    body = _add_sphere(plant, model, parameters, surface)
+    body = _add_sphere(plant, model, parameters, plain)
     plant.WeldFrames(
         plant.world_frame() if parent is None else parent,
         body.body_frame(),
@@ -122,7 +123,7 @@ def add_moving_shell(
     parameters: ShellParameters,
     name: str,
     X_WS: RigidTransform | None = None,
-    surface: Shape | None = None,
+    plain: bool = True,
 ) -> ModelInstanceIndex:
     """Adds a shell whose pose is driven through the model instance's `desired_state` port.
 
@@ -134,13 +135,14 @@ def add_moving_shell(
         parameters: the sphere.
         name: of the model instance; its body is `shell`.
         X_WS: where it is while all six are 0; None for the world's origin.
-        surface: what cameras see in place of a plain sphere, in frame R: a textured mesh.
+        plain: whether it looks like a plain sphere; if not, `plants.shell_surface` is to give it
+            its looks.
 
     Returns:
         The model instance.
     """
     model = plant.AddModelInstance(name)
-    shell = _add_sphere(plant, model, parameters, surface)
+    shell = _add_sphere(plant, model, parameters, plain)
     # Slides and rings between the ground and the sphere: light, but not without mass.
     inertia = SpatialInertia.HollowSphereWithMass(parameters.mass / 20, parameters.radius)
     rings = [plant.AddRigidBody(f"ring_{k}", model, inertia) for k in range(5)]
@@ -166,14 +168,15 @@ def _add_sphere(
     plant: MultibodyPlant,
     model: ModelInstanceIndex,
     p: ShellParameters,
-    surface: Shape | None,
+    plain: bool,
 ) -> RigidBody:
     inertia = SpatialInertia.HollowSphereWithMass(p.mass, p.radius)
     body = plant.AddRigidBody(BODY, model, inertia)
     X_RG = RigidTransform()
     shape = Sphere(p.radius)
     plant.RegisterCollisionGeometry(body, X_RG, shape, BODY, contact_properties(p.friction))
-    plant.RegisterVisualGeometry(body, X_RG, surface or shape, BODY, _COLOUR)
+    if plain:
+        plant.RegisterVisualGeometry(body, X_RG, shape, BODY, _COLOUR)
     return body
 
 

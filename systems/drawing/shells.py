@@ -257,8 +257,7 @@ class _Look:
         corners, steps = self.shell.patches
         size = 2 * self.parameters.spangle_size / self.shell.radius
         near = np.flatnonzero(self._in_sight(corners[:, 0], size))
-        # Seen from outside they run the other way round than the picture wants.
-        places, chosen = self._project(self.shell.radius * corners[near][:, ::-1])
+        places, chosen = self._project(self.shell.radius * corners[near])
         if not len(chosen):
             return []
         edges = outlines(places, 255 * steps[near[chosen]])

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -75,6 +76,16 @@ def test_it_stands_where_it_is_put_or_on_what_carries_it() -> None:
         body = plant.GetBodyByName("shell", model)
         assert body.EvalPoseInWorld(context).IsNearlyEqualTo(expected, 1e-12)
     assert plant.CalcTotalMass(context, [carried]) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("add", [add_shell, add_moving_shell])
+def test_without_its_plain_looks_one_can_still_stand_on_it(add: Any) -> None:
+    for plain in (True, False):
+        plant, _ = AddMultibodyPlant(CONFIG, DiagramBuilder())
+        model = add(plant, ShellParameters(), "shell", plain=plain)
+        body = plant.GetBodyByName("shell", model)
+        assert len(plant.GetVisualGeometriesForBody(body)) == plain
+        assert len(plant.GetCollisionGeometriesForBody(body)) == 1
 
 
 # --- Moved ---
