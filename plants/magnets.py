@@ -1,9 +1,10 @@
-"""Magnetic wheels: what holds a robot on a steel shell, and by how much more than it needs."""
+"""Magnetic wheels: what holds a robot on a steel shell."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,9 @@ from pydrake.systems.framework import (
     OutputPort,
 )
 
+from plants.adhesion_margin import Suspension, adhesion_margin
 from plants.shell import ShellParameters
+from systems.markers.pnp import cross_matrix
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -56,66 +59,6 @@ def magnet_force(gap: Any, parameters: MagnetParameters) -> Any:
     return parameters.force / (1 + np.maximum(gap, 0.0) / parameters.gap) ** 2
 
 
-def adhesion_margin(
-    contacts: Array, pulls: Array, weight: Array, centre_of_mass: Array, friction: float
-) -> float:
-    """Returns the adhesion that a robot has over the adhesion that it needs to stay on a sphere.
-
-    It needs as much as keeps it, at rest, from slipping and from tipping over any edge of its
-    wheels. So below 1 it comes off or slides down, and at 3 the magnets could be a third as strong.
-
-    Slipping: the pulls and the normal forces all point to the sphere's centre, so that friction
-    alone balances the moment of the weight about it. With the centre of mass at the distance l, the
-    outward normal n there, and W = W_n n + W_t, that takes sum |T| >= |W_t| l / R. What friction
-    can give is mu sum N, where the forces along n balance: c sum N = H - W_n, with
-    H = sum F (n_i n) and c the mean of n_i n. So H >= W_n + c |W_t| l / (mu R). With W_t = 0 this
-    says that the pulls carry the weight.
-
-    Tipping: about the line through two contacts, when all others have lost their normal forces, the
-    moment of the pulls must hold that of the weight. All pairs with no wheel beyond are tried.
-
-    Both are necessary for equilibrium, not sufficient: a robot may slip and tip at once. The linear
-    programme of all normal and friction forces, which takes a thousand times as long, finds 0 to
-    25 % less (as a rule 5 %), as the tests show.
-
-    Args:
-        contacts: (n, 3) m, n >= 3, where the wheels touch, from the sphere's centre; any frame.
-        pulls: (n,) N, of the magnets, toward the centre.
-        weight: (3,) N, as a force, in that frame.
-        centre_of_mass: (3,) m, of the robot, from the sphere's centre.
-        friction: coefficient between wheel and sphere.
-
-    Returns:
-        The ratio; inf when no adhesion is needed.
-    """
-    R = np.sqrt((contacts * contacts).sum(axis=1)).mean()
-    distance = np.sqrt(centre_of_mass @ centre_of_mass)
-    n = centre_of_mass / distance
-    outward = weight @ n
-    along = weight - outward * n
-    cosines = contacts @ n / R
-    grip = np.sqrt(along @ along) * distance * cosines.mean()
-    needed = outward + (grip / (friction * R) if friction > 0 else np.inf if grip > 0 else 0.0)
-    margin = pulls @ cosines / needed if needed > 0 else np.inf
-
-    count = len(contacts)
-    first, second = np.repeat(np.arange(count), count), np.tile(np.arange(count), count)
-    p, q = contacts[first], contacts[second]
-    beyond = _cross(p, q) @ contacts.T
-    edges = (beyond <= 1e-9 * R**3).all(axis=1) & (first != second)
-    holding = -beyond[edges] @ pulls / R
-    tipping = -(_cross(centre_of_mass - p[edges], weight) * (q - p)[edges]).sum(axis=1)
-    tips = tipping > 0
-    if tips.any():
-        margin = min(margin, (holding[tips] / tipping[tips]).min())
-    return float(margin)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    # numpy's own takes ten times as long for a handful of vectors.
-    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
-
-
 class MagneticAdhesion(LeafSystem):
     """Pulls the wheels of a robot to a shell, and the shell to them.
 
@@ -133,11 +76,15 @@ class MagneticAdhesion(LeafSystem):
     Args:
         plant: finalized.
         model: the robot; its wheels are the bodies named `..._wheel`, with their origins in their
-            middles.
+            middles. If they all are jointed to two bodies named `..._rocker`, or to a `..._bogie`
+            that is, these are its suspension: their origins are their pivots, and the rockers turn
+            about y of `base_link`, by opposite angles. Else it counts as rigid.
         shell: model instance of the sphere; its body is `shell`.
         wheel_radius: m.
         shell_parameters: the sphere.
         parameters: the magnets.
+        carried: model instances that the robot carries, such as a shell of its own and whoever
+            drives on it.
 
     Ports:
         body_poses (input, list): the plant's `body_poses`.
@@ -146,13 +93,13 @@ class MagneticAdhesion(LeafSystem):
             `applied_spatial_force` (of several robots: joined).
         gaps (output, vector of one for each wheel): between wheel and shell, in the order of the
             bodies, m; negative when they are pressed together.
-        margin (output, vector of 1): see `adhesion_margin`; of the robot as it stands in the
-            default context, under the plant's gravity. The shell's own acceleration and what the
-            robot may carry are left out. Inf when it needs no adhesion.
+        margin (output, vector of 1): see `adhesion_margin`; of the robot with its arms and wheels
+            where they are in the default context, and of what it carries where that is, under the
+            plant's gravity. All accelerations are left out. Inf when it needs no adhesion.
         detached (output, vector of 1): 1 when all gaps are above `detached_gap`, else 0.
 
     Raises:
-        ValueError: less than three wheels.
+        ValueError: less than three wheels, or it is to carry itself or the shell it stands on.
     """
 
     def __init__(
@@ -164,6 +111,7 @@ class MagneticAdhesion(LeafSystem):
         wheel_radius: float,
         shell_parameters: ShellParameters,
         parameters: MagnetParameters | None = None,
+        carried: Sequence[ModelInstanceIndex] = (),
     ) -> None:
         super().__init__()
         require_positive(wheel_radius=wheel_radius)
@@ -177,13 +125,41 @@ class MagneticAdhesion(LeafSystem):
         self._wheels = [int(index) for index in wheels]
         self._shell = int(plant.GetBodyByName("shell", shell).index())
         self._pulled = [*wheels, BodyIndex(self._shell)]
+        self._supports = _supports(plant, wheels)
+        # Which wheel bears on which support, and which way its rocker turns.
+        self._bearing = np.zeros((len(self._supports), len(wheels)))
+        self._senses = np.ones(len(self._supports))
+        for k, (_, borne, rocker) in enumerate(self._supports):
+            self._bearing[k, borne] = 1.0
+            self._senses[k] = 1.0 if rocker == self._supports[0].rocker else -1.0
         base = plant.GetBodyByName("base_link", model)
         self._base = int(base.index())
         context = plant.CreateDefaultContext()
-        mass = plant.CalcTotalMass(context, [model])
-        self._weight = mass * plant.gravity_field().gravity_vector()
         X_BW = base.EvalPoseInWorld(context).inverse()
-        self._p_BCom = X_BW.multiply(plant.CalcCenterOfMassPositionInWorld(context, [model]))
+        p_BCom = X_BW.multiply(plant.CalcCenterOfMassPositionInWorld(context, [model]))
+        # Bodies, their masses, and where in them the centre of mass is; the robot as one.
+        names = [plant.GetModelInstanceName(instance) for instance in carried]
+        allowed = "neither the robot itself nor its shell, and none twice"
+        distinct = {int(instance) for instance in (*carried, model, shell)}
+        require(len(distinct) == len(carried) + 2, "carried", names, allowed)
+        bodies = [
+            plant.get_body(index)
+            for instance in carried
+            for index in plant.GetBodyIndices(instance)
+        ]
+        self._loads = [
+            (self._base, plant.CalcTotalMass(context, [model]), p_BCom),
+            *(
+                (
+                    int(body.index()),
+                    body.get_mass(context),
+                    body.CalcCenterOfMassInBodyFrame(context),
+                )
+                for body in bodies
+            ),
+        ]
+        self._mass = sum(mass for _, mass, _ in self._loads)
+        self._weight = self._mass * plant.gravity_field().gravity_vector()
         self._body_poses_input = self.DeclareAbstractInputPort(
             "body_poses", AbstractValue.Make([RigidTransform()])
         )
@@ -207,6 +183,8 @@ class MagneticAdhesion(LeafSystem):
         builder: DiagramBuilder, plant: MultibodyPlant, **arguments: Any
     ) -> MagneticAdhesion:
         """Adds the block for the only robot on magnets in a plant, connected both ways.
+
+        Of several robots the forces have to be joined: `JoinForces`.
 
         Args:
             builder: of the diagram that the plant is in.
@@ -265,16 +243,127 @@ class MagneticAdhesion(LeafSystem):
 
     def _calc_margin(self, context: Context, output: Any) -> None:
         poses = self._body_poses_input.Eval(context)
+        centre = poses[self._shell].translation()
         offsets, distances = self._wheels_seen(poses)
+        contacts = offsets * (self._shell_radius / distances)[:, None]
+        moment = sum(mass * poses[body].multiply(p) for body, mass, p in self._loads)
         margin = adhesion_margin(
-            contacts=offsets * (self._shell_radius / distances)[:, None],
+            contacts=contacts,
             pulls=magnet_force(self._gap(distances), self._parameters),
             weight=self._weight,
-            centre_of_mass=poses[self._base].multiply(self._p_BCom)
-            - poses[self._shell].translation(),
+            centre_of_mass=moment / self._mass - centre,
             friction=self._friction,
+            suspension=self._suspension(poses, contacts) if self._supports else None,
         )
         output.SetFromVector([margin])
+
+    def _suspension(self, poses: list[RigidTransform], contacts: Array) -> Suspension:
+        centre = poses[self._shell].translation()
+        supports = np.array(
+            [
+                contacts[wheels[0]] if pivot is None else poses[pivot].translation() - centre
+                for pivot, wheels, _ in self._supports
+            ]
+        )
+        rockers = np.array(
+            [poses[rocker].translation() - centre for _, _, rocker in self._supports]
+        )
+        axis = cross_matrix(poses[self._base].rotation().matrix()[:, 1])
+        sway = self._senses[:, None] * ((supports - rockers) @ axis.T)
+        return Suspension(supports, self._bearing, sway)
+
+
+class _Support(NamedTuple):
+    """Where a robot on rockers rests: indices of bodies, and of the wheels that bear on it."""
+
+    pivot: int | None  # of a bogie; None for a wheel's own contact
+    wheels: list[int]
+    rocker: int
+
+
+def _supports(plant: MultibodyPlant, wheels: list[BodyIndex]) -> list[_Support]:
+    """Returns what the wheels bear on if all are on two rockers, else nothing."""
+    joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
+    mounts = {int(joint.child_body().index()): joint.parent_body() for joint in joints}
+    found: dict[int, _Support] = {}
+    for place, wheel in enumerate(wheels):
+        mount = mounts.get(int(wheel))
+        pivot = None
+        if mount is not None and mount.name().endswith("_bogie"):
+            pivot = int(mount.index())
+            mount = mounts.get(pivot)
+        if mount is None or not mount.name().endswith("_rocker"):
+            return []
+        key = int(wheel) if pivot is None else pivot
+        found.setdefault(key, _Support(pivot, [], int(mount.index()))).wheels.append(place)
+    supports = list(found.values())
+    return supports if len({support.rocker for support in supports}) == 2 else []
+
+
+class JoinForces(LeafSystem):
+    """Joins the forces of several robots for the plant, which takes them on one port.
+
+    .. pydrake_system::
+
+        name: JoinForces
+        input_ports:
+        - "forces_{k}"
+        output_ports:
+        - forces
+
+    Args:
+        robots: how many, n.
+
+    Ports:
+        forces_{k} (input, list): of one of them, such as `MagneticAdhesion` sends.
+        forces (output, list): all of them, in that order, for `applied_spatial_force`.
+
+    Raises:
+        ValueError: no robot.
+    """
+
+    def __init__(self, *, robots: int) -> None:
+        super().__init__()
+        require(robots >= 1, "robots", robots, "at least 1")
+        model = AbstractValue.Make([ExternallyAppliedSpatialForce()])
+        self._inputs = [
+            self.DeclareAbstractInputPort(f"forces_{k + 1}", model) for k in range(robots)
+        ]
+        self._forces_output = self.DeclareAbstractOutputPort(
+            "forces",
+            lambda: AbstractValue.Make([ExternallyAppliedSpatialForce()]),
+            self._calc_forces,
+            {port.ticket() for port in self._inputs},
+        )
+
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder, plant: MultibodyPlant, adhesions: Sequence[MagneticAdhesion]
+    ) -> JoinForces:
+        """Adds the block for all robots on magnets in a plant, which are connected both ways.
+
+        Args:
+            builder: of the diagram that the plant is in.
+            plant: finalized.
+            adhesions: in the diagram, not connected yet.
+        """
+        joined = builder.AddSystem(JoinForces(robots=len(adhesions)))
+        for k, adhesion in enumerate(adhesions):
+            builder.Connect(plant.get_body_poses_output_port(), adhesion.body_poses_input_port())
+            builder.Connect(adhesion.forces_output_port(), joined.forces_input_port(k + 1))
+        builder.Connect(joined.forces_output_port(), plant.get_applied_spatial_force_input_port())
+        return joined
+
+    def forces_input_port(self, k: int) -> InputPort:
+        """Returns the port of the k-th robot's forces, k from 1."""
+        return self._inputs[k - 1]
+
+    def forces_output_port(self) -> OutputPort:
+        """Returns the port of all forces."""
+        return self._forces_output
+
+    def _calc_forces(self, context: Context, output: Any) -> None:
+        output.set_value([force for port in self._inputs for force in port.Eval(context)])
 
 
 def _at_origin(body: BodyIndex, F_W: Array) -> ExternallyAppliedSpatialForce:

@@ -69,6 +69,7 @@ class SnailBotParameters:
         clearance: from the shell to the chassis' base, m.
         mass: of the chassis with all it carries, kg.
         mass_height: of its centre of mass over its base, m.
+        mount: height of what holds a shell of its own over the chassis, m.
         servo_gain: torque by error of wheel speed, N m s/rad.
         max_torque: of one wheel's motor, N m.
         rotor_inertia: of one motor's rotor, as the wheel feels it: times the gear ratio squared,
@@ -89,6 +90,7 @@ class SnailBotParameters:
     clearance: float = 0.010
     mass: float = 0.13
     mass_height: float = 0.010
+    mount: float = 0.005
     servo_gain: float = 2.0
     max_torque: float = 0.08
     rotor_inertia: float = 5e-6
@@ -150,6 +152,23 @@ def stance(angles: Array, parameters: SnailBotParameters, shell: ShellParameters
         shell: the sphere.
     """
     return pose_on_shell(angles, shell.radius + parameters.clearance - _OVERLAP)
+
+
+def carried_shell_pose(parameters: SnailBotParameters, shell: ShellParameters) -> RigidTransform:
+    """Returns `X_BR` of a shell that the robot carries on its back, for `plants.shell.add_shell`.
+
+    The axes of the shell's frame R are those of B: its pole is on top, its yaw 0 in front. Its
+    centre is over B's origin, `mount` above the chassis.
+
+    It takes stronger magnets to carry it. With the default sizes and another robot anywhere on the
+    upper half of it, for a margin of 1.5 (`plants.adhesion_margin`): 6.5 N a wheel on the pole, 8.5
+    along the equator (roll 90), 20 at latitude 60 and 36 anywhere, whatever the heading.
+
+    Args:
+        parameters: the robot that carries it.
+        shell: the sphere that is carried.
+    """
+    return RigidTransform([0.0, 0.0, parameters.height + parameters.mount + shell.radius])
 
 
 def half_track(parameters: SnailBotParameters, shell: ShellParameters) -> float:

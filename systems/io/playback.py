@@ -82,8 +82,13 @@ def read_channel(
 
     def make(message: Any) -> Any:
         value = function(message)
-        if shift and isinstance(value, Message) and hasattr(value, "stamp"):
-            return dataclasses.replace(value, stamp=_shifted(value.stamp, shift))  # type: ignore[type-var]
+        if shift and isinstance(value, Message):
+            stamps = {
+                name: _shifted(getattr(value, name), shift)
+                for name in ("stamp", "previous_stamp")
+                if hasattr(value, name)
+            }
+            return dataclasses.replace(value, **stamps)  # type: ignore[type-var]
         return value
 
     entries = []

@@ -1,6 +1,6 @@
 """Which conversion belongs to which ROS message type, for recording and for playing back.
 
-The conversions themselves are in `ros_vision`, `ros_motion` and `ros_scan`.
+The conversions themselves are in `ros_vision`, `ros_flow`, `ros_motion` and `ros_scan`.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from systems.io import ros_motion, ros_scan, ros_vision
+from systems.io import ros_flow, ros_motion, ros_scan, ros_vision
 from systems.validation import nearest
 
 Encoder = Callable[[Any, float], Any]
@@ -28,6 +28,7 @@ ENCODERS: Mapping[str, Encoder] = {
     "sensor_msgs/msg/CompressedImage": lambda v, _: ros_vision.image_to_ros(v),
     "sensor_msgs/msg/Imu": lambda v, t: ros_motion.imu_to_ros(v, stamp=t, frame_id="imu"),
     "sensor_msgs/msg/LaserScan": lambda v, _: ros_scan.scan_to_ros(v),
+    "sensor_msgs/msg/PointCloud2": lambda v, _: ros_flow.matches_to_ros(v),
 }
 
 DECODERS: Mapping[str, Decoder] = {
@@ -43,6 +44,7 @@ DECODERS: Mapping[str, Decoder] = {
     "sensor_msgs/msg/Image": ros_vision.image_from_ros,
     "sensor_msgs/msg/Imu": ros_motion.imu_from_ros,
     "sensor_msgs/msg/LaserScan": ros_scan.scan_from_ros,
+    "sensor_msgs/msg/PointCloud2": ros_flow.matches_from_ros,
     "tf/msg/tfMessage": ros_motion.transforms_from_ros,
     "tf2_msgs/msg/TFMessage": ros_motion.transforms_from_ros,
 }

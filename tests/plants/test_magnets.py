@@ -10,9 +10,11 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog
 
-from plants.magnets import MagneticAdhesion, MagnetParameters, adhesion_margin, magnet_force
+from plants.adhesion_margin import Suspension, adhesion_margin
+from plants.magnets import JoinForces, MagneticAdhesion, MagnetParameters, magnet_force
 from plants.shell import ShellParameters, add_shell, pose_on_shell
-from plants.snailbot import SnailBotParameters, add_snailbot
+from plants.snailbot import SnailBotParameters, add_snailbot, wheel_centres
+from tests.plants.two_robots import TwoRobots
 
 RADIUS = 0.075
 COM = np.array([0.0, 0.0, 0.09])  # 15 mm above the pole
@@ -104,20 +106,43 @@ def test_it_is_in_proportion_and_knows_no_axes() -> None:
         assert margin(direction, contacts=CONTACTS[order]) == pytest.approx(reference)
 
 
-def least_adhesion(direction: np.ndarray, friction: float, com: np.ndarray) -> float:
-    """The smallest scale of the pulls with which normal and friction forces hold the robot."""
+def least_adhesion(
+    direction: np.ndarray,
+    friction: float,
+    com: np.ndarray,
+    contacts: np.ndarray = CONTACTS,
+    pivots: tuple[np.ndarray, np.ndarray] | None = None,
+) -> float:
+    """The smallest scale of the pulls with which normal and friction forces hold the robot.
+
+    With `pivots`, (2, 3) of the bogies and of the rockers, about y, right and left: of front and
+    middle wheel no moment about their bogie's is left, and of a side's three about the rockers'
+    the same on both.
+    """
     weight = WEIGHT * direction / np.linalg.norm(direction)
-    n = CONTACTS / RADIUS
-    columns = [np.concatenate([-(PULLS[:, None] * n).sum(axis=0), np.zeros(3)])]
-    for p, normal in zip(CONTACTS, n, strict=True):
+
+    def wrench(k: int, f: np.ndarray) -> np.ndarray:
+        found = [*f, *np.cross(contacts[k], f)]
+        if pivots is not None:
+            bogies, rockers = pivots
+            side = k // 3
+            about = [np.cross(contacts[k] - p[side], f)[1] for p in (bogies, rockers)]
+            found += [about[0] * (side == s and k % 3 < 2) for s in (0, 1)]
+            found.append(about[1] * (1 if side else -1))
+        return np.array(found)
+
+    n = contacts / np.linalg.norm(contacts, axis=1, keepdims=True)
+    columns = [np.sum([wrench(k, -PULLS[k] * normal) for k, normal in enumerate(n)], axis=0)]
+    for k, normal in enumerate(n):
         t = np.cross(normal, [0.3, 0.9, 0.1])
         t /= np.linalg.norm(t)
         u = np.cross(normal, t)
         for angle in np.arange(32) * np.pi / 16:
             f = normal + friction * (np.cos(angle) * t + np.sin(angle) * u)
-            columns.append(np.concatenate([f, np.cross(p, f)]))
-    sought = -np.concatenate([weight, np.cross(com, weight)])
-    scale = np.array([1, 1, 1, 20, 20, 20])  # moments are in fractions of N m
+            columns.append(wrench(k, f))
+    sought = np.zeros(len(columns[0]))
+    sought[:6] = -np.concatenate([weight, np.cross(com, weight)])
+    scale = np.where(np.arange(len(sought)) < 3, 1, 20)  # moments are in fractions of N m
     cost = np.eye(1, len(columns))[0]
     found = linprog(
         cost, A_eq=np.array(columns).T * scale[:, None], b_eq=sought * scale, bounds=(0, None)
@@ -139,6 +164,71 @@ def test_it_is_what_statics_allow(friction: float, height: float) -> None:
     assert min(ratios) > 0.994
     assert max(ratios) < 1.3
     assert np.median(ratios) < 1.1
+
+
+# --- Margin of a robot on rockers ---
+
+
+def on_rockers(contacts: np.ndarray, bogies: np.ndarray, rockers: np.ndarray) -> Suspension:
+    """Wheels right front, middle, rear, left ...; pivots (2, 3), right and left, about y."""
+    supports = np.array([bogies[0], contacts[2], bogies[1], contacts[5]])
+    bearing = np.zeros((4, 6))
+    for row, wheels in enumerate(([0, 1], [2], [3, 4], [5])):
+        bearing[row, wheels] = 1
+    arms = supports - np.repeat(rockers, 2, axis=0)
+    sway = np.cross([0.0, 1.0, 0.0], arms) * np.array([1, 1, -1, -1])[:, None]
+    return Suspension(supports, bearing, sway)
+
+
+@pytest.mark.parametrize(
+    ("x", "y"), [(0.1, 0.0), (0.1, 0.02), (0.1, -0.05), (-0.1, 0.03), (0.0, 0.15), (0.2, 0.2)]
+)
+def test_a_load_aslant_by_hand(x: float, y: float) -> None:
+    # On the flat, with a load at x, y from the middle axle's middle. The normal forces of rear
+    # wheels and bogies' pivots, apart from the pulls, F and 2 F, follow from their sum, from the
+    # moments about both axes, and from the rockers, whose moments are the same on both sides. The
+    # one that comes nearest to nothing decides.
+    a, b, h, large = 0.013, 0.0065, 0.036, 1e4
+    A = np.array([[1, 1, 1, 1], [b, -a, b, -a], [-h, -h, h, h], [b, -a, -b, a]])
+    by_weight = np.linalg.solve(A, WEIGHT * np.array([1, x, y, 0]))
+    expected = (np.array([8, 4, 8, 4]) / -by_weight)[by_weight < 0].min()
+    plane = np.array([[x, y, large] for y in (-h, h) for x in (a, 0.0, -a)])
+    contacts = plane * large / np.linalg.norm(plane, axis=1, keepdims=True)
+    bogies = np.array([[b, y, large + 0.002] for y in (-h, h)])
+    rockers = np.array([[0.0, y, large + 0.01] for y in (-h, h)])
+    found = margin(
+        [0, 0, -1], friction=1e6, com=np.array([x, y, large + 0.05]), contacts=contacts,
+        suspension=on_rockers(contacts, bogies, rockers),
+    )  # fmt: skip
+    assert found == pytest.approx(expected, rel=1e-3)
+
+
+def test_on_rockers_it_is_what_statics_allow() -> None:
+    # With a load on its back, so that tipping decides. Taken for rigid, it would be said to hold
+    # half as much again as it does, and at times five times as much.
+    robot = SnailBotParameters()
+    up = np.array([0.0, 0.0, 1.0])
+    contacts = wheel_centres(robot, ShellParameters()) + (RADIUS + robot.clearance) * up
+    bogies = (contacts[[0, 3]] + contacts[[1, 4]]) / 2 + robot.bogie_pivot * up
+    rockers = contacts[[1, 4]] + robot.rocker_pivot * up
+    contacts *= RADIUS / np.linalg.norm(contacts, axis=1, keepdims=True)
+    suspension = on_rockers(contacts, bogies, rockers)
+    rng = np.random.default_rng(2)
+    ratios: list[float] = []
+    rigid: list[float] = []
+    for direction in rng.normal(size=(60, 3)):
+        com = np.array([*rng.normal(size=2) * 0.03, 0.16])
+        exact = least_adhesion(direction, 0.8, com, contacts, (bogies, rockers))
+        if exact > 0.1:
+            for found, model in ((ratios, suspension), (rigid, None)):
+                held = margin(direction, com=com, contacts=contacts, suspension=model)
+                found.append(held * exact)
+    assert len(ratios) > 30
+    assert min(ratios) > 0.8
+    assert max(ratios) < 1.4
+    assert 0.9 < np.median(ratios) < 1.0
+    assert np.median(rigid) > 1.3
+    assert max(rigid) > 4.0
 
 
 # --- Block ---
@@ -230,12 +320,29 @@ def test_the_margin_is_that_of_the_robot_as_it_stands() -> None:
         if "wheel" in body.name():
             offset = body.EvalPoseInWorld(context).translation() - p_WR
             contacts.append(offset * RADIUS / np.linalg.norm(offset))
+    weight = np.array([0, 0, -9.81 * rig.plant.CalcTotalMass(context, [rig.model])])
+    com = rig.plant.CalcCenterOfMassPositionInWorld(context, [rig.model]) - p_WR
+    X_WB = rig.plant.GetBodyByName("base_link", rig.model).EvalPoseInWorld(context)
+    R = X_WB.rotation().matrix()
+
+    def in_base(*names: str) -> np.ndarray:
+        bodies = [rig.plant.GetBodyByName(name, rig.model) for name in names]
+        return np.array([body.EvalPoseInWorld(context).translation() - p_WR for body in bodies]) @ R
+
+    # In the axes of the robot, which make no difference, so that its y is the rockers' axis.
+    touching = np.array(contacts) @ R
+    order = np.lexsort([-touching[:, 0], touching[:, 1] > 0])  # right front, middle, rear, left ...
+    suspension = on_rockers(
+        touching[order],
+        in_base("right_bogie", "left_bogie"),
+        in_base("right_rocker", "left_rocker"),
+    )
     expected = adhesion_margin(
-        np.array(contacts), PULLS,
-        np.array([0, 0, -9.81 * rig.plant.CalcTotalMass(context, [rig.model])]),
-        rig.plant.CalcCenterOfMassPositionInWorld(context, [rig.model]) - p_WR, 0.8,
-    )  # fmt: skip
+        touching[order], PULLS, weight @ R, com @ R, 0.8, suspension=suspension
+    )
     assert rig.output("margin") == pytest.approx(expected)
+    # As if nothing gave way it would be more.
+    assert adhesion_margin(np.array(contacts), PULLS, weight, com, 0.8) > 1.2 * expected
 
 
 def test_a_model_without_wheels_is_refused() -> None:
@@ -247,3 +354,69 @@ def test_a_model_without_wheels_is_refused() -> None:
             plant=plant, model=shell, shell=shell, wheel_radius=0.006,
             shell_parameters=ShellParameters(),
         )  # fmt: skip
+
+
+def test_what_it_carries_weighs_on_it() -> None:
+    margins = {}
+    for carried in (True, False):
+        rig = TwoRobots([0.0, 0.0, 60.0], below=(20, 70, 30), load=carried)
+        margins[carried] = [rig.output(k, "margin")[0] for k in (0, 1)]
+    # On the one below it weighs, not on the one above, which hangs on its own magnets.
+    assert margins[True][0] < margins[False][0] / 5
+    assert margins[True][1] == margins[False][1]
+    # And it weighs as one heavier robot would, with its centre of mass where Drake says.
+    rig = TwoRobots([0.0, 0.0, 60.0], below=(20, 70, 30))
+    everything = [*rig.robots, rig.shells[1]]
+    total = rig.plant.CalcTotalMass(rig.plant_context, everything)
+    block = rig.adhesions[0]
+    poses = rig.plant.get_body_poses_output_port().Eval(rig.plant_context)
+    com = sum(mass * poses[body].multiply(p) for body, mass, p in block._loads) / total
+    expected = rig.plant.CalcCenterOfMassPositionInWorld(rig.plant_context, everything)
+    np.testing.assert_allclose(com, expected, atol=1e-9)
+    assert total == pytest.approx(2 * 0.242 + 0.28)
+
+
+def test_where_the_other_stands_makes_a_difference() -> None:
+    # Behind, the far rear wheels' axle is nearer to the load than the bogies' pivots are in front:
+    # it takes less to tip forward.
+    margins = {}
+    for yaw in (0.0, 90.0, 180.0):
+        rig = TwoRobots([0.0, 0.0, yaw])
+        margins[yaw] = rig.output(0, "margin")[0]
+    assert margins[0.0] < margins[180.0] < margins[90.0]
+
+
+@pytest.mark.parametrize("wrong", ["itself", "its shell", "one twice"])
+def test_what_it_cannot_carry_is_refused(wrong: str) -> None:
+    rig = TwoRobots([0.0, 0.0, 0.0])
+    load = {
+        "itself": [rig.robots[0]],
+        "its shell": [rig.shells[0]],
+        "one twice": [rig.robots[1], rig.robots[1]],
+    }[wrong]
+    with pytest.raises(ValueError, match=r"carried is \['\w+'.*\]: must be neither the robot"):
+        MagneticAdhesion(
+            plant=rig.plant, model=rig.robots[0], shell=rig.shells[0], wheel_radius=0.006,
+            shell_parameters=ShellParameters(), carried=load,
+        )  # fmt: skip
+
+
+def test_the_forces_of_all_robots_reach_the_plant() -> None:
+    rig = TwoRobots([0.0, 0.0, 0.0])
+    port = rig.plant.get_applied_spatial_force_input_port()
+    reached = port.Eval(rig.plant_context)
+    sent = [force for k in (0, 1) for force in rig.output(k, "forces")]
+    assert len(reached) == len(sent) == 14
+    for a, b in zip(reached, sent, strict=True):
+        assert a.body_index == b.body_index
+        np.testing.assert_array_equal(a.F_Bq_W.get_coeffs(), b.F_Bq_W.get_coeffs())
+    # Between robots and shells alone: nothing is pulled by the world.
+    total = np.sum([force.F_Bq_W.get_coeffs() for force in reached], axis=0)
+    np.testing.assert_allclose(total, 0.0, atol=1e-12)
+    names = [rig.plant.get_body(force.body_index).scoped_name().get_full() for force in reached]
+    assert names.count("one_shell::shell") == 1
+
+
+def test_joining_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="robots is 0: must be at least 1"):
+        JoinForces(robots=0)

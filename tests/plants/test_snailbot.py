@@ -24,6 +24,7 @@ from plants.snailbot import (
     SnailBotParameters,
     add_snailbot,
     body_velocity,
+    carried_shell_pose,
     half_track,
     servo_matrix,
     stance,
@@ -32,6 +33,7 @@ from plants.snailbot import (
 )
 from systems.sensors.imu import GRAVITY, ideal_sample
 from systems.shell.angles import angle_differences, rotation, rotation_error
+from tests.plants.two_robots import TwoRobots
 
 DEFAULT = SnailBotParameters()
 SHELL = ShellParameters()
@@ -430,3 +432,67 @@ def test_the_motors_are_no_stronger_than_they_may_be() -> None:
         rig.run(1.0)
         assert (rig.normal()[2] > 0.2) == climbs
         assert (rig.normal()[2] < -0.02) == (not climbs)
+
+
+# --- With a shell of its own and another robot on it ---
+
+
+def test_a_carried_shell_is_over_the_chassis() -> None:
+    X_BR = carried_shell_pose(LARGE, LARGE_SHELL)
+    lowest = X_BR.translation()[2] - LARGE_SHELL.radius
+    assert lowest == pytest.approx(LARGE.height + LARGE.mount)
+    np.testing.assert_array_equal(X_BR.translation()[:2], 0.0)
+    np.testing.assert_array_equal(X_BR.rotation().matrix(), np.eye(3))  # its pole is on top
+
+
+@pytest.mark.parametrize(
+    ("below", "angles"),
+    [
+        ((0, 90, 0), (0, 0, 0)),  # on top, with the other before it
+        ((0, 90, 0), (0, 0, 180)),  # behind it
+        ((0, 90, 0), (0, 0, 45)),
+        ((0, 0, 0), (0, 90, 0)),  # sideways, nose up
+        ((180, 0, 0), (0, 90, 0)),  # nose down
+        ((75, 0, 0), (0, 90, 0)),
+        ((0, -90, 0), (0, 90, 0)),  # hanging
+    ],
+)
+def test_what_holds_a_carrier_is_what_its_margin_says(
+    below: tuple[int, int, int], angles: tuple[int, int, int]
+) -> None:
+    # It tips over the pivots of its bogies. Just above 1 it may still fall: the load comes on it
+    # at once.
+    unit = TwoRobots(angles, below=below, forces=(1.0, 6.0)).output(0, "margin")[0]
+    for share, falls in ((0.8, True), (1.5, False)):
+        rig = TwoRobots(angles, below=below, forces=(share / unit, 6.0))
+        assert rig.output(0, "margin") == pytest.approx(share)
+        rig.run(0.6)
+        assert (rig.output(0, "gaps").max() > 2e-3) == falls
+
+
+@pytest.mark.parametrize(
+    ("below", "v", "forces"),
+    [
+        ((0.0, 90.0, 0.0), 0.0, (7.0, 4.0)),  # it stands on the pole
+        ((90.0, 0.0, 0.0), 0.01, (9.0, 4.0)),  # it drives along the equator, hanging sideways
+    ],
+)
+def test_one_drives_on_the_shell_that_another_carries(
+    below: tuple[float, float, float], v: float, forces: tuple[float, float]
+) -> None:
+    rig = TwoRobots((0.0, 0.0, 0.0), below=below, forces=forces)
+    starts = [rig.pose(k).rotation().matrix() for k in (0, 1)]
+    rig.command(0, v, 0.0)
+    rig.command(1, 0.03, 0.0)
+    for _ in range(10):  # from the equator over the pole to well below the other side's middle
+        rig.run(0.55)
+        for k in (0, 1):
+            assert rig.output(k, "gaps").max() < 0.0
+            assert rig.output(k, "gaps").min() > -2.5e-4
+            assert rig.output(k, "margin") > 1.45
+    for k, (speed, exact) in enumerate(((v, 0.05), (0.03, 0.03))):
+        moved = rotation_error(rig.pose(k).rotation().matrix(), starts[k])
+        along = moved @ starts[k][:, 1]
+        aside = moved - along * starts[k][:, 1]
+        assert along == pytest.approx(speed * 5.5 / SHELL.radius, rel=exact, abs=0.01)
+        assert np.linalg.norm(aside) < math.radians(1.5)
