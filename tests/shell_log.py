@@ -38,6 +38,7 @@ DEG = math.radians(1.0)
 RATE = 300  # Hz, of the IMU
 EACH = 5  # samples of the IMU for each picture
 VIEW = ShellView(camera=CAMERA)
+CAMERA_HEIGHT = VIEW.parameters.camera_height
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,7 @@ class Errors:
 
     placement: float = 0.5 * DEG
     mounting: float = 1.0 * DEG
-    scale: float = 0.02
+    scale: float = 0.02  # of the flow: a camera 1 / (1 + scale) times as high as planned
     bias: float = 0.3 * DEG  # rad/s
     rock: float = 0.3 * DEG
     missed: float = 0.2  # part of the passages over markers
@@ -76,7 +77,8 @@ class ShellLog:
         increments: by the sample at which they arrive.
         markers: likewise.
         second: the sample at which a second marker had been seen.
-        mounting: (3,) true turn of the camera, in B. scale: true scale error. bias: (3,).
+        mounting: (3,) true turn of the camera, in B. scale: of the flow over the shell, by the
+            camera's true height. bias: (3,).
         ids: (n,) the marker in view, seen or not; 0 for none.
     """
 
@@ -150,11 +152,12 @@ def drive(seed: int, errors: Errors = BASE, iterations: int = 1) -> ShellLog:
     R = R_RN @ Rotation.from_rotvec(rock).as_matrix()
     p = (RADIUS + HEIGHT) * R_RN[:, :, 2]
     turned = Rotation.from_rotvec(mounting).as_matrix() @ X_BC.rotation().matrix()
-    X_BC_true = RigidTransform(RotationMatrix(turned), X_BC.translation())
+    lower = np.array([0.0, 0.0, CAMERA_HEIGHT * scale / (1 + scale)])
+    X_BC_true = RigidTransform(RotationMatrix(turned), X_BC.translation() - lower)
     markers = misplaced(MAP, bound=errors.placement, seed=seed)
     localizer = shell_localizer(marker_map=MAP, camera=CAMERA, X_BC=X_BC)
     flow = SphereFlowEstimator(view=VIEW, parameters=SphereFlowParameters(hypotheses=16))
-    points = FlowProjectorParameters(points=80, scale_error=scale)
+    points = FlowProjectorParameters(points=80)
     increments, poses, ids = {}, {}, np.zeros(n, np.int64)
     last, missing, met, second, passages = 0, False, set(), n, 0
     places = np.array([marker.X_WM.translation() for marker in MAP])

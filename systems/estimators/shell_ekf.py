@@ -43,8 +43,9 @@ from systems.validation import require, require_non_negative, require_positive
 Array = NDArray[np.float64]
 
 REASONS = (
-    "accepted", "gated", "ambiguous", "bad_marker_pose", "stale", "future", "restarted",
-    "flow_accepted", "flow_gated", "bad_flow", "stale_flow", "bad_imu", "bad_reference",
+    "accepted", "gated", "unconfirmed", "ambiguous", "bad_marker_pose", "stale", "future",
+    "restarted", "flow_accepted", "flow_gated", "bad_flow", "stale_flow", "bad_imu",
+    "bad_reference",
 )  # fmt: skip
 
 _SAME_TIME = 1e-6  # s
@@ -122,15 +123,17 @@ class ShellEkf(LeafSystem):
         nis (output, vector of 2): of the last marker pose that was compared, the squared
             Mahalanobis distance by degrees of freedom (1 on average if all is right), refused ones
             included; and how many there were. [NaN, 0] before the first.
-        health (output, Health): marker poses accepted, refused by the gate, as ambiguous, as bad,
-            as too late or from the future; how often it began anew; increments accepted, refused by
+        health (output, Health): marker poses accepted, refused by the gate, kept to confirm the
+            start, refused as ambiguous, as bad, as too late or from the future; how often it began
+            anew; increments accepted, refused by
             the gate, as bad, as too late; IMU samples and reference velocities not used.
 
     The state is that of the last picture, found on the IMU's clock by the estimated delay. Gravity
     is not used: an accelerometer's bias of up to 20 mg is 1.1 degrees of tilt, more than flow and
     gyro with their errors known lose in a quarter of the routine, and the shell's own tilt would be
-    one more unknown. A pose that does not fit is refused; what starts the filter wrongly is found
-    out when two refused poses of different markers agree.
+    one more unknown. The filter starts with the second of two poses that agree, as a single one may
+    be wrong. A pose that does not fit is refused; what starts the filter wrongly nevertheless is
+    found out when two refused poses of different markers agree.
 
     Source: error state and left-multiplied rotation errors: Sola, "Quaternion kinematics for the
     error-state Kalman filter", arXiv:1711.02508, 2017. Camera mounting and delay as states: Li,
@@ -357,7 +360,7 @@ class ShellEkf(LeafSystem):
         turn = self._turn(now, increment.previous_stamp, increment.stamp)
         seen = self._advance(now, increment.stamp, increment.rotation)
         slack = p.flow_floor**2 + p.flow_noise**2 * float(increment.rotation @ increment.rotation)
-        # A delay hardly known yet shows beyond the first order where the rate changes.
+        # Where the rate changes, what is not known of the delay is mostly noise (`delay_slack`).
         bend = turn.rate_after - turn.rate_before
         slack += (p.delay_slack * float(np.linalg.norm(bend))) ** 2 * now.state.P[DELAY, DELAY]
         update = self._model.update_flow(
@@ -391,8 +394,10 @@ class ShellEkf(LeafSystem):
             turn = self._turn(now, told.stamp, memory[_TIME])
             R_now = R @ rotation_from_vector(self._model.step(now.state, turn)[0])
             moved = np.kron(np.eye(2), R_now @ R.T)
+            place = R_now @ (R.T @ place)
             noise = moved @ told.covariance @ moved.T + self._floor
-            self._weigh(now, R_now, R_now @ (R.T @ place), noise)
+            noise[3:, 3:] += p.height_noise**2 * np.outer(place, place) / (place @ place)
+            self._weigh(now, R_now, place, noise)
 
     def _weigh(self, now: _Now, R: Array, place: Array, noise: Array) -> None:
         """Takes a marker pose of the state's time, starts from it, or refuses it."""
@@ -400,11 +405,16 @@ class ShellEkf(LeafSystem):
         marker = int(np.argmax(self._directions @ place))
         unknown = float(np.diag(now.state.P)[THETA].max()) > p.start_beyond**2
         state = now.state
+        if unknown and not self._agrees_with_refused(now, R):
+            now.counts["unconfirmed"] += 1
+            now.refused[:] = [*R.ravel(), marker, now.memory[_TIME]]
+            return
         if unknown:
             state = model.start(state, R, marker, p.initial_deviation**2)
         update = model.update_marker(state, marker, R, place, noise, p.marker_gate)
         now.nis = update.nis
-        if not update.accepted and self._agrees_with_refused(now, R, marker):
+        another = now.refused[9] != marker
+        if not update.accepted and another and self._agrees_with_refused(now, R):
             now.counts["restarted"] += 1
             fresh = State(R, np.zeros_like(state.x), p.initial_covariance(len(self._ids)))
             state = model.start(fresh, R, marker, p.initial_deviation**2)
@@ -413,12 +423,12 @@ class ShellEkf(LeafSystem):
         if update.accepted:
             now.state = update.state
             now.refused[:] = np.nan
-        elif now.refused[9] != marker:
+        elif another:
             now.refused[:] = [*R.ravel(), marker, now.memory[_TIME]]
 
-    def _agrees_with_refused(self, now: _Now, R: Array, marker: int) -> bool:
+    def _agrees_with_refused(self, now: _Now, R: Array) -> bool:
         before = now.refused[:9].reshape(3, 3)
-        if math.isnan(now.refused[9]) or now.refused[9] == marker:
+        if math.isnan(now.refused[9]):
             return False
         angle = np.linalg.norm(rotation_vector(R @ before.T))
         return bool(angle < self._parameters.recovery_angle)

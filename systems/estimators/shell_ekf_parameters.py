@@ -58,13 +58,17 @@ class ShellEkfParameters:
             with: what the model of a tilted camera leaves.
         flow_floor: deviation of an increment, each axis, beside that, rad.
         delay_std: of the camera's delay on the IMU's clock at the start, s.
-        delay_slack: part of what an increment changes by the deviation of the delay that counts as
-            noise: what the first order leaves.
+        delay_slack: how many times what the deviation of the delay changes of an increment counts
+            as noise. The delay is found where the gyro's rate changes, but vibration and rocking
+            change it too, and the flow sees nothing of the one and little of the other: an error in
+            a factor is none in the product, and passes for knowledge.
         rock_std: of the body's tilt against the normal, each axis, rad: 0.3 degrees.
         rock_time: its correlation time, s.
         placement_std: of a marker's place and turn on the sphere, each axis, rad: 0.5 degrees.
         marker_rotation_noise: deviation of a marker pose's rotation beside its covariance, rad.
         marker_position_noise: of its position, m: the shell is not as round as it should be.
+        height_noise: the same along the normal, m: the camera is not as high as planned, by so much
+            a marker pose is wrong all the time, and it tells only where the robot is in direction.
         marker_gate: largest squared Mahalanobis distance of a marker pose that is taken; of 6
             degrees of freedom, one in 10,000 good ones is beyond 27.9.
         flow_gate: of an increment; of 3 degrees of freedom, one in 10,000 is beyond 21.1. Wider
@@ -92,12 +96,13 @@ class ShellEkfParameters:
     flow_noise: float = 0.003
     flow_floor: float = 1e-5
     delay_std: float = 0.02
-    delay_slack: float = 0.3
+    delay_slack: float = 5.0
     rock_std: float = math.radians(0.3) * _EVENLY
     rock_time: float = 0.2
     placement_std: float = math.radians(0.5) * _EVENLY
     marker_rotation_noise: float = math.radians(0.02)
     marker_position_noise: float = 1e-5
+    height_noise: float = 0.5e-3
     marker_gate: float = 28.0
     flow_gate: float = 50.0
     horizon: float = 0.25

@@ -14,7 +14,7 @@ from pydrake.systems.framework import Context, EventStatus, InputPort, OutputPor
 
 from systems.cameras import PinholeCamera
 from systems.flow.shell import back_project, inside, project
-from systems.messages import PointMatches, whole_nanoseconds
+from systems.messages import PointMatches
 from systems.noise import NoiseStream
 from systems.sensors.sampled import SampledSensor
 from systems.validation import require, require_non_negative, require_positive
@@ -110,6 +110,8 @@ class FlowProjector(SampledSensor):
         parameters: number of points, noise, scale error and losses.
         rate: pictures a second, Hz.
         latency: from a picture to the arrival of its matches, s.
+        clock_error: by how much the stamps are late on the clock of all others, s; at most the
+            latency.
         seed: of the noise, a parameter of the Context.
         name: of the noise stream.
         frame_id: name of the optical frame in the messages.
@@ -118,11 +120,11 @@ class FlowProjector(SampledSensor):
         pose (input, RigidTransform): `X_RC`, of the camera's true optical frame; R has its origin
             in the shell's centre and turns with the shell.
         matches (output, PointMatches): of the last two pictures, sampled at `rate`, sent `latency`
-            later; the stamp is the later picture's time, NaN before the second. Without a match
-            (the camera looks past the shell, or the picture is lost) it has none.
+            later; the stamp is the later picture's time by its clock, NaN before the second.
+            Without a match (the camera looks past the shell, or the picture is lost) it has none.
 
     Raises:
-        ValueError: radius, rate, latency or seed out of range.
+        ValueError: radius, rate, latency, clock error or seed out of range.
     """
 
     def __init__(
@@ -133,6 +135,7 @@ class FlowProjector(SampledSensor):
         parameters: FlowProjectorParameters | None = None,
         rate: float = 60.0,
         latency: float = 0.0,
+        clock_error: float = 0.0,
         seed: int = 0,
         name: str = "flow_projector",
         frame_id: str = "camera_optical",
@@ -147,10 +150,14 @@ class FlowProjector(SampledSensor):
         self._pose_input = self.DeclareAbstractInputPort(
             "pose", AbstractValue.Make(RigidTransform())
         )
-        # Time, quaternion and position of the camera at the last picture.
+        # Stamp, quaternion and position of the camera at the last picture.
         self._last = self.DeclareDiscreteState(np.array([math.nan, 1, 0, 0, 0, 0, 0, 0]))
         self._matches_output = self._declare_sampling(
-            name="matches", rate=rate, latency=latency, nothing=PointMatches(frame_id=frame_id)
+            name="matches",
+            rate=rate,
+            latency=latency,
+            nothing=PointMatches(frame_id=frame_id),
+            clock_error=clock_error,
         )
 
     def pose_input_port(self) -> InputPort:
@@ -179,7 +186,7 @@ class FlowProjector(SampledSensor):
         status = super()._take(context, state)
         X_RC: RigidTransform = self._pose_input.Eval(context)
         wxyz = X_RC.rotation().ToQuaternion().wxyz()
-        stamp = whole_nanoseconds(context.get_time())
+        stamp = self._stamp(context.get_time())
         last = np.concatenate([[stamp], wxyz, X_RC.translation()])
         state.get_mutable_discrete_state().set_value(self._last, last)
         return status

@@ -261,6 +261,8 @@ class MarkerProjector(SampledSensor):
         parameters: limits, noise and misses.
         rate: pictures a second, Hz.
         latency: from the picture to the arrival of its detections, s.
+        clock_error: by how much the stamps are late on the clock of all others, s; at most the
+            latency.
         seed: of the noise; numeric parameter 0 of the Context, so that a study may vary it.
         name: of the noise stream; one for each camera.
         frame_id: name of the optical frame in the messages.
@@ -277,7 +279,8 @@ class MarkerProjector(SampledSensor):
     Only the five rays to the corners and the centre are tested: a pole between them hides nothing.
 
     Raises:
-        ValueError: an id outside the family, or a size, rate, latency or seed out of range.
+        ValueError: an id outside the family, or a size, rate, latency, clock error or seed out of
+            range.
     """
 
     def __init__(
@@ -291,6 +294,7 @@ class MarkerProjector(SampledSensor):
         parameters: ProjectorParameters | None = None,
         rate: float = 30.0,
         latency: float = 0.0,
+        clock_error: float = 0.0,
         seed: int = 0,
         name: str = "marker_projector",
         frame_id: str = "camera_optical",
@@ -324,6 +328,7 @@ class MarkerProjector(SampledSensor):
             rate=rate,
             latency=latency,
             nothing=Detections(frame_id=frame_id, family=family.name),
+            clock_error=clock_error,
         )
 
     def query_object_input_port(self) -> InputPort:

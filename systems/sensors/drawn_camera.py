@@ -114,6 +114,8 @@ class DrawnCamera(MountedCamera):
             fixed to the same frame, is left out.
         parameters: light and print.
         latency: from the middle of the exposure to arrival, s.
+        clock_error: by how much the stamps are late on the clock of all others, s; at most the
+            latency.
         effects: lens, exposure and noise. `supersampling` changes nothing: areas are exact.
         clipping: as of the rendered camera; only what is wholly farther than the second distance
             is left out, m.
@@ -136,8 +138,9 @@ class DrawnCamera(MountedCamera):
     shadows and no reflections.
 
     Raises:
-        ValueError: rate, latency, clipping or seed out of range, markers without a family or of
-            another one, or a distortion that cannot be inverted along the picture's border.
+        ValueError: rate, latency, clock error, clipping or seed out of range, markers without a
+            family or of another one, or a distortion that cannot be inverted along the picture's
+            border.
     """
 
     def __init__(
@@ -152,6 +155,7 @@ class DrawnCamera(MountedCamera):
         shells: Sequence[DrawnShell] = (),
         parameters: DrawingParameters | None = None,
         latency: float = 0.0,
+        clock_error: float = 0.0,
         effects: ImageEffects | None = None,
         clipping: tuple[float, float] = (0.01, 50.0),
         seed: int = 0,
@@ -165,6 +169,7 @@ class DrawnCamera(MountedCamera):
             X_PC=X_PC,
             rate=rate,
             latency=latency,
+            clock_error=clock_error,
             effects=effects,
             clipping=clipping,
             seed=seed,

@@ -32,6 +32,8 @@ class MountedCamera(SampledSensor):
         X_PC: pose of the optical frame in the body.
         rate: pictures a second, Hz.
         latency: from the middle of the exposure to arrival, s.
+        clock_error: by how much the stamps are late on the clock of all others, s; at most the
+            latency.
         effects: lens, exposure and noise.
         clipping: nearest and farthest distance that are seen, m.
         seed: of the noise, a parameter of the Context.
@@ -39,7 +41,7 @@ class MountedCamera(SampledSensor):
         frame_id: of the optical frame, for the messages.
 
     Raises:
-        ValueError: rate, latency, clipping or seed out of range.
+        ValueError: rate, latency, clock error, clipping or seed out of range.
     """
 
     def __init__(
@@ -49,6 +51,7 @@ class MountedCamera(SampledSensor):
         X_PC: RigidTransform,
         rate: float,
         latency: float,
+        clock_error: float,
         effects: ImageEffects | None,
         clipping: tuple[float, float],
         seed: int,
@@ -69,7 +72,11 @@ class MountedCamera(SampledSensor):
         )
         self._velocity_input = self.DeclareVectorInputPort("spatial_velocity", 6)
         self._image_output = self._declare_sampling(
-            name="image", rate=rate, latency=latency, nothing=CameraImage(frame_id=frame_id)
+            name="image",
+            rate=rate,
+            latency=latency,
+            nothing=CameraImage(frame_id=frame_id),
+            clock_error=clock_error,
         )
 
     def query_object_input_port(self) -> InputPort:

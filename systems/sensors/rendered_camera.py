@@ -38,6 +38,8 @@ class RenderedCamera(MountedCamera):
         renderer: name of the renderer in the SceneGraph.
         rate: pictures a second, Hz.
         latency: from the middle of the exposure to arrival, s.
+        clock_error: by how much the stamps are late on the clock of all others, s; at most the
+            latency.
         effects: lens, exposure and noise.
         clipping: nearest and farthest distance that is drawn, m.
         seed: of the noise, a parameter of the Context.
@@ -55,8 +57,8 @@ class RenderedCamera(MountedCamera):
     during an exposure; the camera moves by its body's velocity.
 
     Raises:
-        ValueError: rate, latency, clipping or seed out of range, or a distortion that cannot be
-            inverted in the picture.
+        ValueError: rate, latency, clock error, clipping or seed out of range, or a distortion that
+            cannot be inverted in the picture.
     """
 
     def __init__(
@@ -68,6 +70,7 @@ class RenderedCamera(MountedCamera):
         renderer: str,
         rate: float,
         latency: float = 0.0,
+        clock_error: float = 0.0,
         effects: ImageEffects | None = None,
         clipping: tuple[float, float] = (0.01, 50.0),
         seed: int = 0,
@@ -79,6 +82,7 @@ class RenderedCamera(MountedCamera):
             X_PC=X_PC,
             rate=rate,
             latency=latency,
+            clock_error=clock_error,
             effects=effects,
             clipping=clipping,
             seed=seed,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from typing import Any
 
@@ -10,7 +11,7 @@ from pydrake.systems.framework import Context, EventStatus, LeafSystem, OutputPo
 
 from systems.messages import Message, whole_nanoseconds
 from systems.noise import sample_index
-from systems.validation import require_non_negative, require_positive
+from systems.validation import require, require_non_negative, require_positive
 
 # Drake computes the next time of an event that has an offset from the present time, and leaves the
 # event out when another one lies a rounding error before it: one in a thousand messages would not
@@ -27,7 +28,13 @@ class SampledSensor(LeafSystem):
     """
 
     def _declare_sampling(
-        self, *, name: str, rate: float, latency: float, nothing: Message
+        self,
+        *,
+        name: str,
+        rate: float,
+        latency: float,
+        nothing: Message,
+        clock_error: float = 0.0,
     ) -> OutputPort:
         """Declares state, events and the output port.
 
@@ -36,17 +43,23 @@ class SampledSensor(LeafSystem):
             rate: Hz.
             latency: time from measurement to arrival, s.
             nothing: what is sent before the first arrival.
+            clock_error: by how much the stamps are late on the clock of all others, s: what is
+                measured at t is said to be of t + clock_error. At most `latency`, as nothing may
+                come from the future.
 
         Returns:
             The output port. It changes only when a message arrives.
 
         Raises:
-            ValueError: rate or latency out of range.
+            ValueError: rate, latency or clock_error out of range.
         """
         require_positive(rate=rate)
         require_non_negative(latency=latency)
+        sound = math.isfinite(clock_error) and clock_error <= latency
+        require(sound, "clock_error", clock_error, f"at most the latency, {latency:g} s")
         self.rate = rate
         self.latency = latency
+        self.clock_error = clock_error
         self._delivered = self.DeclareAbstractState(AbstractValue.Make(nothing))
         self._under_way = self.DeclareAbstractState(AbstractValue.Make(()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._take)
@@ -68,13 +81,17 @@ class SampledSensor(LeafSystem):
 
         Args:
             context: the block's context at the time of measurement.
-            stamp: that time, in whole nanoseconds, s.
+            stamp: that time by the sensor's clock, in whole nanoseconds, s.
             index: number of the sample, the key of its noise (see `systems.noise`).
         """
 
+    def _stamp(self, t: float) -> float:
+        """Returns the time t (s) by the sensor's clock, in whole nanoseconds."""
+        return whole_nanoseconds(t + self.clock_error)
+
     def _take(self, context: Context, state: State) -> EventStatus:
         t = context.get_time()
-        message = self._measure(context, whole_nanoseconds(t), sample_index(t, self.rate))
+        message = self._measure(context, self._stamp(t), sample_index(t, self.rate))
         slot = self._slot(state, self._under_way)
         slot.set_value((*slot.get_value(), (t + self.latency, message)))
         return EventStatus.Succeeded()

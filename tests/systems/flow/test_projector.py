@@ -171,6 +171,11 @@ def test_it_arrives_late_under_its_own_time() -> None:
     for a, b in zip(prompt, late, strict=False):
         assert a.stamp == b.stamp
         np.testing.assert_array_equal(a.current, b.current)
+    wrong = [m for m in run(0.15, latency=0.03, clock_error=0.02) if not np.isnan(m.stamp)]
+    for told, true in zip(wrong, late, strict=True):  # only the stamps are others
+        assert told.stamp == pytest.approx(true.stamp + 0.02, abs=1e-9)
+        assert told.previous_stamp == pytest.approx(true.previous_stamp + 0.02, abs=1e-9)
+        np.testing.assert_array_equal(told.current, true.current)
     assert len(run(0.045, latency=0.03)) <= 2  # the second picture's are still under way
     assert all(np.isnan(m.stamp) for m in run(0.045, latency=0.03))
 

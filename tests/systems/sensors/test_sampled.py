@@ -6,10 +6,18 @@ from typing import Any
 
 import pytest
 from pydrake.common.value import AbstractValue
+from pydrake.geometry import FrameId
+from pydrake.math import RigidTransform
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, DiscreteValues, LeafSystem
 
+from systems.cameras import PinholeCamera
+from systems.flow.projector import FlowProjector
+from systems.markers.family import family
+from systems.markers.projector import MarkerProjector
 from systems.messages import Message
+from systems.sensors.drawn_camera import DrawnCamera
+from systems.sensors.rendered_camera import RenderedCamera
 from systems.sensors.sampled import SampledSensor
 
 
@@ -22,20 +30,26 @@ class Reading(Message):
 class Clock(SampledSensor):
     """Measures the time."""
 
-    def __init__(self, rate: float, latency: float) -> None:
+    def __init__(self, rate: float, latency: float, clock_error: float = 0.0) -> None:
         super().__init__()
         self.out = self._declare_sampling(
-            name="reading", rate=rate, latency=latency, nothing=Reading()
+            name="reading",
+            rate=rate,
+            latency=latency,
+            nothing=Reading(),
+            clock_error=clock_error,
         )
 
     def _measure(self, context: Context, stamp: float, index: int) -> Reading:
-        assert abs(stamp - context.get_time()) < 1e-9
+        assert abs(stamp - self.clock_error - context.get_time()) < 1e-9
         return Reading(stamp, index)
 
 
-def arrivals(rate: float, latency: float, start: float, end: float) -> list[tuple[float, Reading]]:
+def arrivals(
+    rate: float, latency: float, start: float, end: float, clock_error: float = 0.0
+) -> list[tuple[float, Reading]]:
     """The readings and when each arrived, to 1 ms."""
-    clock = Clock(rate, latency)
+    clock = Clock(rate, latency, clock_error)
     simulator = Simulator(clock)
     context = simulator.get_mutable_context()
     context.SetTime(start)
@@ -61,6 +75,29 @@ def test_every_reading_arrives_its_latency_later_in_order(latency: float) -> Non
     for arrived, reading in found:
         assert reading.stamp == reading.index / rate
         assert arrived == pytest.approx(reading.stamp + latency, abs=1e-9)
+
+
+CAMERA = PinholeCamera.from_focal_length(64, 48, 50.0)
+MOUNTED: dict[str, Any] = {"parent_frame": FrameId.get_new_id(), "X_PC": RigidTransform()}
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda **a: FlowProjector(camera=CAMERA, rate=60.0, **a),
+        lambda **a: DrawnCamera(camera=CAMERA, rate=60.0, **MOUNTED, **a),
+        lambda **a: RenderedCamera(camera=CAMERA, rate=60.0, renderer="vtk", **MOUNTED, **a),
+        lambda **a: MarkerProjector(
+            camera=CAMERA, markers=[], family=family("DICT_4X4_50"), **MOUNTED, **a
+        ),
+    ],
+    ids=["flow", "drawn", "rendered", "projected"],
+)
+def test_whoever_samples_pictures_may_have_a_clock_that_is_off(build: Any) -> None:
+    assert build(latency=0.04, clock_error=0.03).clock_error == 0.03
+    assert build().clock_error == 0.0
+    with pytest.raises(ValueError, match=r"clock_error is 0.05: must be at most the latency, 0.04"):
+        build(latency=0.04, clock_error=0.05)
 
 
 class Busy(LeafSystem):
@@ -122,6 +159,18 @@ def test_stamps_are_what_a_recording_keeps() -> None:
         assert reading.stamp == round(reading.stamp * 1e9) / 1e9
 
 
+@pytest.mark.parametrize(("latency", "error"), [(0.03, 0.03), (0.05, 0.03), (0.0, -0.01)])
+def test_a_clock_that_is_off_shows_in_the_stamps_and_in_nothing_else(
+    latency: float, error: float
+) -> None:
+    right = arrivals(50.0, latency, 0.0, 0.4)
+    wrong = arrivals(50.0, latency, 0.0, 0.4, clock_error=error)
+    assert [(t, reading.index) for t, reading in wrong] == [(t, r.index) for t, r in right]
+    for (arrived, late), (_, true) in zip(wrong, right, strict=True):
+        assert late.stamp == round((true.stamp + error) * 1e9) / 1e9
+        assert late.stamp <= arrived + 1e-9  # nothing comes from the future
+
+
 def test_contexts_do_not_share_what_is_under_way() -> None:
     clock = Clock(50.0, 0.1)
     first, second = Simulator(clock), Simulator(clock)
@@ -137,7 +186,15 @@ def test_contexts_do_not_share_what_is_under_way() -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("rate", 0.0), ("rate", math.inf), ("latency", -0.1), ("latency", math.nan)],
+    [
+        ("rate", 0.0),
+        ("rate", math.inf),
+        ("latency", -0.1),
+        ("latency", math.nan),
+        ("clock_error", 0.01),
+        ("clock_error", math.nan),
+        ("clock_error", -math.inf),
+    ],
 )
 def test_nonsense_is_refused(field: str, value: float) -> None:
     arguments: dict[str, Any] = {"rate": 10.0, "latency": 0.0} | {field: value}

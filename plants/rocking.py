@@ -1,0 +1,331 @@
+"""A body that rocks on its springs, carried by a chassis that does not.
+
+B0 is the chassis' frame, B that of the body on the springs: their origins are one, and
+`R_B0B = exp([r]x)` with r = (x, y, 0), a tilt against the chassis' z.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import FrameId, FramePoseVector, GeometryFrame, SceneGraph
+from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.systems.framework import (
+    Context,
+    DiagramBuilder,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    ValueProducer,
+)
+
+from systems.noise import NoiseStream
+from systems.validation import require, require_non_negative, require_positive
+
+Array = NDArray[np.float64]
+
+_SINES = 12  # for each axis
+_FADE = 0.5  # s
+_SMALL = 1e-2  # rad^2; below, series are more exact than what they are the series of
+
+
+@dataclass
+class RockingParameters:
+    """How a body rocks: a random motion whose spectrum is even from one frequency to another.
+
+    Attributes:
+        bound: of the tilt about each axis, rad. The standard deviation is bound / sqrt(3), that of
+            what lies evenly within the bound; the tilt, nearly normally distributed, is beyond it
+            for a twelfth of the time.
+        lowest: frequency, Hz.
+        highest: frequency, Hz.
+    """
+
+    bound: float = math.radians(0.3)
+    lowest: float = 0.2
+    highest: float = 3.0
+
+    def __post_init__(self) -> None:
+        require_non_negative(bound=self.bound)
+        require_positive(lowest=self.lowest, highest=self.highest)
+        above = self.highest > self.lowest
+        require(above, "highest", self.highest, f"greater than lowest, {self.lowest:g} Hz")
+
+
+class Waves(NamedTuple):
+    """Sines that make up a tilt: it is the imaginary part of the sum of weights exp(i rates t).
+
+    Attributes:
+        rates: (2, n) for x and y, rad/s.
+        weights: (3, 2, n) complex: of the tilt, of its first and of its second derivative by time.
+    """
+
+    rates: Array
+    weights: NDArray[np.complex128]
+
+
+def draw_waves(parameters: RockingParameters, random: np.random.Generator) -> Waves:
+    """Draws the sines: one from each of as many equal parts of the band, so that none is empty."""
+    p, shape = parameters, (2, _SINES)
+    place = (np.arange(_SINES) + random.random(shape)) / _SINES
+    rates = 2 * math.pi * (p.lowest + (p.highest - p.lowest) * place)
+    amplitude = p.bound * math.sqrt(2 / (3 * _SINES))
+    wave = amplitude * np.exp(1j * random.uniform(0, 2 * math.pi, shape))
+    return Waves(rates, np.array([wave, 1j * rates * wave, -(rates**2) * wave]))
+
+
+def tilt(waves: Waves, t: float) -> tuple[Array, Array, Array]:
+    """Returns the tilt (2,) rad at t (s), and its first and second derivative by time.
+
+    It fades in during the first half second, from rest at zero.
+    """
+    q, q_dot, q_ddot = (waves.weights * np.exp(1j * t * waves.rates)).sum(axis=-1).imag
+    s = t / _FADE
+    if s >= 1:
+        return q, q_dot, q_ddot
+    # s^3 (10 - 15 s + 6 s^2): its first and second derivative are zero at both ends.
+    f = s**3 * (10 - 15 * s + 6 * s * s)
+    f_dot = 30 * (s * (1 - s)) ** 2 / _FADE
+    f_ddot = 60 * s * (1 - s) * (1 - 2 * s) / _FADE**2
+    return f * q, f_dot * q + f * q_dot, f_ddot * q + 2 * f_dot * q_dot + f * q_ddot
+
+
+def _coefficients(s: float) -> tuple[float, float, float, float, float]:
+    """Returns sin(a) / a, b = (1 - cos(a)) / s, c = (a - sin(a)) / (a s), db/ds, dc/ds; s = a^2."""
+    if s < _SMALL:
+        return (
+            1 - s * (1 / 6 - s * (1 / 120 - s / 5040)),
+            1 / 2 - s * (1 / 24 - s * (1 / 720 - s / 40320)),
+            1 / 6 - s * (1 / 120 - s * (1 / 5040 - s / 362880)),
+            -1 / 24 + s * (1 / 360 - s / 13440),
+            -1 / 120 + s * (1 / 2520 - s / 120960),
+        )
+    angle = math.sqrt(s)
+    a, b = math.sin(angle) / angle, (1 - math.cos(angle)) / s
+    c = (1 - a) / s
+    return a, b, c, (a - 2 * b) / (2 * s), (b - 3 * c) / (2 * s)
+
+
+def tilted(r: Array, r_dot: Array, r_ddot: Array) -> tuple[Array, Array, Array]:
+    """Returns how a body that is tilted is turned, and turns.
+
+    With r = (x, y, 0) and k = x dy/dt - y dx/dt the angular velocity J(r) dr/dt, J the left
+    Jacobian of SO(3), is (dx/dt + c k y, dy/dt - c k x, b k).
+
+    Args:
+        r: (2,) tilt about x and y, rad.
+        r_dot: (2,) rad/s.
+        r_ddot: (2,) rad/s^2.
+
+    Returns:
+        `R_B0B` (3, 3), the angular velocity (3,) of B in B0 and the angular acceleration (3,), told
+        in B0.
+    """
+    (x, y), (u, v), (du, dv) = r.tolist(), r_dot.tolist(), r_ddot.tolist()
+    s = x * x + y * y
+    a, b, c, b_s, c_s = _coefficients(s)
+    k, dk, ds = x * v - y * u, x * dv - y * du, 2 * (x * u + y * v)
+    ck, d_ck = c * k, c_s * ds * k + c * dk
+    R = np.array(
+        [
+            [1 - b * y * y, b * x * y, a * y],
+            [b * x * y, 1 - b * x * x, -a * x],
+            [-a * y, a * x, 1 - b * s],
+        ]
+    )
+    w = np.array([u + ck * y, v - ck * x, b * k])
+    alpha = np.array([du + d_ck * y + ck * v, dv - d_ck * x - ck * u, b_s * ds * k + b * dk])
+    return R, w, alpha
+
+
+class RockingBody(LeafSystem):
+    """Rocks on its springs over a chassis, at random within a band of frequencies.
+
+    .. pydrake_system::
+
+        name: RockingBody
+        input_ports:
+        - pose
+        - spatial_velocity
+        - spatial_acceleration
+        output_ports:
+        - pose
+        - spatial_velocity
+        - spatial_acceleration
+        - frame_pose
+
+    Args:
+        parameters: how far and how fast.
+        frame_id: of a geometry frame that rocks with the body, its parent the world's; None for
+            none.
+        seed: of the motion, a parameter of the Context.
+        name: of the noise stream.
+
+    Ports:
+        pose (input, RigidTransform): `X_WB0` of the chassis.
+        spatial_velocity (input, vector of 6): of B0 in W, rotation first (rad/s, m/s).
+        spatial_acceleration (input, vector of 6): likewise (rad/s^2, m/s^2).
+        pose (output, RigidTransform): `X_WB`; its origin is B0's.
+        spatial_velocity (output, vector of 6): of B in W, rotation first (rad/s, m/s).
+        spatial_acceleration (output, vector of 6): likewise (rad/s^2, m/s^2).
+        frame_pose (output, FramePoseVector): `X_WB` for SceneGraph; empty without a frame.
+
+    The motion is a sum of sines drawn from the seed and depends on nothing but the time: nothing
+    that happens to the chassis shakes the body, and the body's inertia does not act back. It fades
+    in during the first half second.
+
+    Raises:
+        ValueError: seed out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        parameters: RockingParameters | None = None,
+        frame_id: FrameId | None = None,
+        seed: int = 0,
+        name: str = "rocking",
+    ) -> None:
+        super().__init__()
+        self._parameters = parameters or RockingParameters()
+        self._frame_id = frame_id
+        self._noise = NoiseStream(self, seed=seed, name=name)
+        self._pose_input = self.DeclareAbstractInputPort(
+            "pose", AbstractValue.Make(RigidTransform())
+        )
+        self._velocity_input = self.DeclareVectorInputPort("spatial_velocity", 6)
+        self._acceleration_input = self.DeclareVectorInputPort("spatial_acceleration", 6)
+        self._waves = self.DeclareCacheEntry(
+            "sines of this seed",
+            ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=self._calc_waves),
+            {self.all_parameters_ticket()},
+        )
+        self._motion = self.DeclareCacheEntry(
+            "the body in the chassis",
+            ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=self._calc_motion),
+            {self.time_ticket(), self._waves.ticket()},
+        )
+        tickets = [
+            self._motion.ticket(),
+            self._pose_input.ticket(),
+            self._velocity_input.ticket(),
+            self._acceleration_input.ticket(),
+        ]
+        self._pose_output = self.DeclareAbstractOutputPort(
+            "pose",
+            lambda: AbstractValue.Make(RigidTransform()),
+            lambda context, output: output.set_value(self._X_WB(context)),
+            set(tickets[:2]),
+        )
+        self._velocity_output = self.DeclareVectorOutputPort(
+            "spatial_velocity", 6, self._calc_velocity, set(tickets[:3])
+        )
+        self._acceleration_output = self.DeclareVectorOutputPort(
+            "spatial_acceleration", 6, self._calc_acceleration, set(tickets)
+        )
+        self._frame_pose_output = self.DeclareAbstractOutputPort(
+            "frame_pose",
+            lambda: AbstractValue.Make(FramePoseVector()),
+            self._calc_frame_pose,
+            set(tickets[:2]),
+        )
+
+    @property
+    def frame_id(self) -> FrameId | None:
+        """The geometry frame that rocks with the body."""
+        return self._frame_id
+
+    def pose_input_port(self) -> InputPort:
+        """Returns the port of the chassis' pose."""
+        return self._pose_input
+
+    def spatial_velocity_input_port(self) -> InputPort:
+        """Returns the port of the chassis' velocity."""
+        return self._velocity_input
+
+    def spatial_acceleration_input_port(self) -> InputPort:
+        """Returns the port of the chassis' acceleration."""
+        return self._acceleration_input
+
+    def pose_output_port(self) -> OutputPort:
+        """Returns the port of the body's pose."""
+        return self._pose_output
+
+    def spatial_velocity_output_port(self) -> OutputPort:
+        """Returns the port of the body's velocity."""
+        return self._velocity_output
+
+    def spatial_acceleration_output_port(self) -> OutputPort:
+        """Returns the port of the body's acceleration."""
+        return self._acceleration_output
+
+    def frame_pose_output_port(self) -> OutputPort:
+        """Returns the port of the geometry frame's pose."""
+        return self._frame_pose_output
+
+    def _calc_waves(self, context: Context, output: AbstractValue) -> None:
+        output.set_value([draw_waves(self._parameters, self._noise.generator(context, 0))])
+
+    def _calc_motion(self, context: Context, output: AbstractValue) -> None:
+        (waves,) = self._waves.Eval(context)
+        output.set_value([tilted(*tilt(waves, context.get_time()))])
+
+    def _in_chassis(self, context: Context) -> tuple[Array, Array, Array]:
+        """Returns rotation, angular velocity and acceleration of B in B0, told there."""
+        motion: tuple[Array, Array, Array] = self._motion.Eval(context)[0]
+        return motion
+
+    def _X_WB(self, context: Context) -> RigidTransform:
+        rotation = RotationMatrix(self._in_chassis(context)[0])
+        X_WB0: RigidTransform = self._pose_input.Eval(context)
+        return RigidTransform(X_WB0.rotation().multiply(rotation), X_WB0.translation())
+
+    def _calc_velocity(self, context: Context, output: Any) -> None:
+        V = self._velocity_input.Eval(context).copy()
+        R_WB0 = self._pose_input.Eval(context).rotation()
+        V[:3] += R_WB0.multiply(self._in_chassis(context)[1])
+        output.SetFromVector(V)
+
+    def _calc_acceleration(self, context: Context, output: Any) -> None:
+        A = self._acceleration_input.Eval(context).copy()
+        _, w, alpha = self._in_chassis(context)
+        R_WB0 = self._pose_input.Eval(context).rotation()
+        x, y, z = self._velocity_input.Eval(context)[:3].tolist()
+        u, v, s = R_WB0.multiply(w).tolist()
+        # What turns with the chassis turns: the Coriolis part.
+        A[:3] += R_WB0.multiply(alpha)
+        A[:3] += [y * s - z * v, z * u - x * s, x * v - y * u]
+        output.SetFromVector(A)
+
+    def _calc_frame_pose(self, context: Context, output: AbstractValue) -> None:
+        poses = FramePoseVector()
+        if self._frame_id is not None:
+            poses.set_value(self._frame_id, self._X_WB(context))
+        output.set_value(poses)
+
+    @staticmethod
+    def AddToBuilder(
+        builder: DiagramBuilder,
+        scene_graph: SceneGraph,
+        *,
+        parameters: RockingParameters | None = None,
+        seed: int = 0,
+        name: str = "rocking",
+    ) -> RockingBody:
+        """Adds the block with a geometry frame of its name, connected to the scene.
+
+        A camera on the body has this frame (`frame_id`) as its parent.
+        """
+        source = scene_graph.RegisterSource(name)
+        frame = scene_graph.RegisterFrame(source, GeometryFrame(name))
+        block = builder.AddSystem(
+            RockingBody(parameters=parameters, frame_id=frame, seed=seed, name=name)
+        )
+        block.set_name(name)
+        builder.Connect(block.frame_pose_output_port(), scene_graph.get_source_pose_port(source))
+        return block
