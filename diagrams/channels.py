@@ -15,15 +15,20 @@ from systems.io.playback import MessagePlayback, VectorPlayback, read_channel
 from systems.io.recorder import Channel
 from systems.io.ros_motion import (
     command_from_ros,
+    estimate_to_ros,
     imu_from_ros,
     imu_to_ros,
     planar_estimate_from_ros,
     planar_estimate_to_ros,
     planar_pose_to_ros,
     pose_from_ros,
+    pose_to_ros,
 )
+from systems.io.ros_types import message_class
 from systems.io.ros_wheels import wheel_angles_from_ros, wheel_angles_to_ros
-from systems.messages import CameraImage, Detections, Scan
+from systems.messages import CameraImage, Detections, PointMatches, PoseEstimate, Scan
+from systems.pose_vector import pose_from_vector, pose_to_vector
+from systems.shell.angles import SHELL_FRAME
 
 
 @dataclass(frozen=True)
@@ -197,6 +202,67 @@ def estimate_signal(robot: str, rate: float) -> Signal:
             [part.ravel() for part in planar_estimate_from_ros(message)]
         ),
         model=12,
+        rate=rate,
+        played=False,
+    )
+
+
+def matches_signal(device: str, rate: float) -> Signal:
+    """Returns the signal of the points that a camera finds in two pictures."""
+    return Signal(
+        port=f"{device}.matches",
+        topic=topic_of(f"{device}.matches"),
+        encode="sensor_msgs/msg/PointCloud2",
+        decode=None,
+        model=PointMatches(),
+        rate=rate,
+    )
+
+
+def shell_truth_signal(robot: str) -> Signal:
+    """Returns the signal of a robot's true pose on a shell, as `PoseToVector` gives it."""
+    return Signal(
+        port=f"truth.{robot}.pose",
+        topic=f"/truth/{robot}/pose",
+        encode=lambda value, t: pose_to_ros(pose_from_vector(value), stamp=t, frame_id=SHELL_FRAME),
+        decode=lambda message: pose_to_vector(pose_from_ros(message)),
+        model=7,
+        rate=50.0,
+        played=False,
+    )
+
+
+def shell_estimate_signal(robot: str, rate: float) -> Signal:
+    """Returns the signal of an estimate on a shell: (43,) the pose's vector, then its covariance.
+
+    The covariance is by rows, rotation first.
+    """
+    return Signal(
+        port=f"{robot}.estimate",
+        topic=f"/{robot}/estimate",
+        encode=lambda value, t: estimate_to_ros(
+            PoseEstimate(
+                stamp=t,
+                frame_id=SHELL_FRAME,
+                pose=pose_from_vector(value),
+                covariance=value[7:].reshape(6, 6),
+            )
+        ),
+        decode=None,
+        model=43,
+        rate=rate,
+        played=False,
+    )
+
+
+def number_signal(port: str, rate: float) -> Signal:
+    """Returns the signal of a single number that is written down only."""
+    return Signal(
+        port=port,
+        topic=topic_of(port),
+        encode=lambda value, _: message_class("std_msgs/msg/Float64")(float(value[0])),
+        decode=lambda message: np.array([float(message.data)]),
+        model=1,
         rate=rate,
         played=False,
     )

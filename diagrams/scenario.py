@@ -33,7 +33,12 @@ from diagrams.tables import Table
 from systems.validation import nearest, require, require_positive
 
 MISSIONS = Table(
-    "mission", {"navigation": "diagrams.navigation:NavigationScenario"}, method="build"
+    "mission",
+    {
+        "navigation": "diagrams.navigation:NavigationScenario",
+        "snailbot": "diagrams.snailbot:SnailBotScenario",
+    },
+    method="build",
 )
 
 
@@ -83,6 +88,11 @@ class Scenario:
     def __post_init__(self) -> None:
         require(0 <= self.seed < 2**53, "seed", self.seed, "a whole number from 0 to 2^53 - 1")
         require_positive(duration=self.duration, time_step=self.time_step)
+
+    @property
+    def time_limit(self) -> float:
+        """When the run ends at the latest, s."""
+        return self.duration
 
 
 @dataclass

@@ -36,12 +36,16 @@ from systems.sensors.faults import Fault, FaultInjector
 from systems.validation import nearest, require
 
 if typing.TYPE_CHECKING:
-    from diagrams.drivers.body import DifferentialDriveBody
+    from diagrams.shell_world import Shell
     from systems.io.bag import BagReader
 
 BODIES = Table(
     "body",
-    {"differential_drive": "diagrams.drivers.body:DifferentialDriveBody"},
+    {
+        "differential_drive": "diagrams.drivers.body:DifferentialDriveBody",
+        "snailbot": "diagrams.drivers.shell_body:SnailBotBody",
+    },
+    resources=frozenset({"shell"}),
     method="add_model",
 )
 DRIVES = Table(
@@ -55,10 +59,12 @@ DRIVES = Table(
 SENSORS = Table(
     "sensor",
     {
+        "bmi088": "diagrams.drivers.imu:Bmi088",
         "camera": "diagrams.drivers.camera:Camera",
         "imu": "diagrams.drivers.imu:InertialSensor",
         "lidar": "diagrams.drivers.lidar:Lidar",
         "mpu6050": "diagrams.drivers.imu:Mpu6050",
+        "shell_camera": "diagrams.drivers.shell_camera:ShellCamera",
         "wheel_encoders": "diagrams.drivers.encoders:Encoders",
     },
     method="add",
@@ -128,8 +134,10 @@ class Robot:
     Attributes:
         name: prefix of its ports.
         body: its body's driver.
-        start: [x, y, theta].
+        start: where its `Start` says.
         drive: the driver of its wheels.
+        on: name of whose shell it stands on, of a robot on a shell.
+        sensors: its devices by name.
         model: its model instance in the plant.
         frame_id: geometry frame of its base_link.
         state: block with the outputs pose, planar_pose, spatial_velocity, spatial_acceleration.
@@ -140,9 +148,11 @@ class Robot:
     """
 
     name: str
-    body: DifferentialDriveBody
+    body: Any
     start: np.ndarray
     drive: Any = None
+    on: str = ""
+    sensors: dict[str, Choice] = field(default_factory=dict)
     model: Any = None
     frame_id: Any = None
     state: Any = None
@@ -172,6 +182,10 @@ class StationBuilder:
         static_messages: topic to (message type, message), written once into a recording.
         mountings: optical frame to (robot, `X_BC`), for /tf_static.
         end_time: time of the last message that is played, s.
+        outputs: exported so far, by name.
+        shells: that robots stand on, by the name of who has it.
+        pulls: what the magnets of each robot on a shell do: lists of forces for the plant.
+        robots: by name.
     """
 
     world: World
@@ -188,6 +202,10 @@ class StationBuilder:
     static_messages: dict[str, tuple[str, Any]] = field(default_factory=dict)
     mountings: dict[str, tuple[str, RigidTransform]] = field(default_factory=dict)
     end_time: float = 0.0
+    outputs: dict[str, OutputPort] = field(default_factory=dict)
+    shells: dict[str, Shell] = field(default_factory=dict)
+    pulls: list[OutputPort] = field(default_factory=list)
+    robots: dict[str, Robot] = field(default_factory=dict)
     plant: MultibodyPlant = field(init=False)
     scene_graph: SceneGraph = field(init=False)
 
@@ -231,6 +249,7 @@ class StationBuilder:
         if signal is not None:
             port = self.spoiled(port, signal)
             self.signals.append(signal)
+        self.outputs[name] = port
         self.builder.ExportOutput(port, name)
 
     def spoiled(self, port: OutputPort, signal: Signal) -> OutputPort:
@@ -305,6 +324,9 @@ class Station(Diagram):
         plant: the model of world and robots.
         scene_graph: its geometry.
         robots: by name.
+        seed: of all noise.
+        simulated: whether the signals are made here, not played back.
+        shells: that robots stand on, by the name of who has it.
         end_time: when a recording ends, s; infinite for a simulated station.
     """
 
@@ -351,9 +373,12 @@ class Station(Diagram):
                 parameters.body.build(**world.resources()),
                 parameters.start.pose(),
                 parameters.drive.build(),
+                getattr(parameters.start, "on", ""),
+                parameters.sensors,
             )
             for name, parameters in robots.items()
         }
+        station.robots = bodies
         if station.simulated:
             for robot in bodies.values():
                 robot.body.add_model(station, robot)
@@ -379,6 +404,9 @@ class Station(Diagram):
         self.plant = station.plant
         self.scene_graph = station.scene_graph
         self.robots = bodies
+        self.seed = seed
+        self.simulated = station.simulated
+        self.shells = station.shells
         self.end_time = math.inf if station.simulated else station.end_time
         station.builder.BuildInto(self)
         self.set_name("station")

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydrake.geometry import (
+    FramePoseVector,
     MakeRenderEngineVtk,
     Meshcat,
     MeshcatParams,
@@ -28,7 +29,9 @@ from pydrake.geometry import (
     Role,
 )
 from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ExternallyAppliedSpatialForce
+from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import (
     Context,
@@ -41,6 +44,7 @@ from ruamel.yaml import YAML
 import diagrams
 import plants
 import systems
+from diagrams.shell_viewer import ShellViewer
 from diagrams.surroundings_viewer import SurroundingsViewer
 from diagrams.viewer import EstimateViewer
 from plants.boards import add_board
@@ -52,10 +56,12 @@ from plants.differential_drive import (
     add_differential_drive,
     wheel_speeds,
 )
-from plants.magnets import MagneticAdhesion
+from plants.magnets import JoinForces, MagneticAdhesion
 from plants.motors import DcMotors, MotorModel, MotorParameters
 from plants.moving import MovingCylinder, MovingObstacles
 from plants.planar_shapes import PlanarShapes
+from plants.relative_pose import RelativePose
+from plants.rocking import RockingBody, RockingParameters
 from plants.shell import ShellMotion, ShellParameters, add_shell
 from plants.shell_rover import ShellRover
 from plants.snailbot import SnailBotParameters, add_snailbot, stance
@@ -74,6 +80,8 @@ from systems.estimators.gyro_yaw import GyroYaw
 from systems.estimators.madgwick import Madgwick
 from systems.estimators.planar_ekf import PlanarEkf
 from systems.estimators.planar_kalman import PlanarKalmanFilter
+from systems.estimators.pose_chain import PoseChain
+from systems.estimators.reference_motion import CarriedShellMotion, KnownShellMotion
 from systems.estimators.shell_ekf import ShellEkf
 from systems.estimators.shell_rule import ShellRule
 from systems.flow.lucas_kanade import PointTracker
@@ -108,13 +116,17 @@ from systems.planners.astar import AStarPlanner
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor
 from systems.planners.waypoint_sequencer import WaypointSequencer
+from systems.pose_vector import PoseFromVector, PoseToVector
 from systems.sensors.drawn_camera import DrawnCamera
 from systems.sensors.faults import Fault, FaultInjector
 from systems.sensors.imu import Imu, ImuParameters
 from systems.sensors.lidar import Lidar, LidarParameters
+from systems.sensors.missed_passages import MissedPassages
+from systems.sensors.pose_outliers import PoseOutliers
 from systems.sensors.rendered_camera import RenderedCamera
 from systems.sensors.wheel_encoders import WheelEncoders
 from systems.shell.marker_pose import ShellMarkerPose, shell_localizer
+from systems.shell.markers_seen import MarkersSeen
 
 # --- One of each, with inputs ---
 
@@ -151,6 +163,25 @@ def scene(y: float) -> QueryObject:
     context = diagram.CreateDefaultContext()
     SCENES.append((diagram, context))  # the query object looks into them
     return scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
+
+
+def relative_pose(_: Path) -> Case:
+    """A free body as the world sees it, in two places."""
+    builder = DiagramBuilder()
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, 0.01)
+    body = plant.AddRigidBody("body", SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.1, 0.1))
+    plant.Finalize()
+    diagram = builder.Build()
+    queries = []
+    for X_WB in POSES:
+        context = diagram.CreateDefaultContext()
+        plant.SetFreeBodyPose(plant.GetMyMutableContextFromRoot(context), body, X_WB)
+        SCENES.append((diagram, context))
+        own = scene_graph.GetMyContextFromRoot(context)
+        queries.append(scene_graph.get_query_output_port().Eval(own))
+    child = plant.GetBodyFrameIdOrThrow(body.index())
+    system = RelativePose(parent=scene_graph.world_frame_id(), child=child)
+    return Case(system, {"query_object": (queries[0], queries[1])})
 
 
 SCENES: list[Any] = []
@@ -210,6 +241,12 @@ def magnetic_adhesion(_: Path) -> Case:
     return Case(system, {"body_poses": (poses[0], poses[1])})
 
 
+def join_forces(_: Path) -> Case:
+    first, second = ExternallyAppliedSpatialForce(), ExternallyAppliedSpatialForce()
+    second.F_Bq_W = SpatialForce(np.ones(6))
+    return Case(JoinForces(robots=2), {f"forces_{k}": ([first], [first, second]) for k in (1, 2)})
+
+
 def recorder(folder: Path) -> Case:
     channels = [
         Channel("sample", "/imu", "sensor_msgs/msg/Imu", 6, 100.0),
@@ -231,6 +268,19 @@ def viewer(_: Path) -> Case:
     poses = (np.zeros(3), np.ones(3))
     covariances = (0.01 * np.eye(3).ravel(), 0.02 * np.eye(3).ravel())
     return Case(system, {"pose": poses, "covariance": covariances, "truth": poses})
+
+
+def shell_viewer(_: Path) -> Case:
+    system = ShellViewer(
+        meshcat=Meshcat(MeshcatParams(host="localhost")),
+        body=SnailBotParameters(),
+        shell=ShellParameters(),
+        rate=10.0,
+    )
+    poses = tuple(RigidTransform([0.0, y, 0.085]) for y in (0.0, 0.01))
+    covariances = (1e-4 * np.eye(6).ravel(), 2e-4 * np.eye(6).ravel())
+    inputs = {"pose": poses, "covariance": covariances, "reference_pose": poses, "truth": poses}
+    return Case(system, inputs)
 
 
 def surroundings_viewer(_: Path) -> Case:
@@ -324,6 +374,10 @@ CASES: dict[type, Callable[[Path], Case]] = {
     DcMotors: lambda _: Case(
         DcMotors(), {"pwm": vector(120.0, 90.0), "wheel_speeds": vector(3.0, -2.0)}
     ),
+    CarriedShellMotion: lambda _: Case(
+        CarriedShellMotion(),
+        {"imu": vector(0.1, 0.2, 0.3, 0.0, 0.0, 9.81), "calibration": vector(*[0.01] * 18)},
+    ),
     ClearanceMonitor: lambda _: Case(
         ClearanceMonitor(
             footprint=SQUARE, standing=SQUARE.moved([3.0, 0.0, 0.5]), moving_radii=[0.2]
@@ -359,6 +413,11 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "spatial_velocity": vector(0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
             "spatial_acceleration": vector(0.6, 0.5, 0.4, 0.3, 0.2, 0.1),
         },
+    ),
+    JoinForces: join_forces,
+    KnownShellMotion: lambda _: Case(
+        KnownShellMotion(),
+        {"pose": POSES, "spatial_velocity": vector(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)},
     ),
     KinematicDifferentialDrive: lambda _: Case(
         KinematicDifferentialDrive(), {"wheel_speeds": vector(3.0, 5.0)}
@@ -453,6 +512,28 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "increment": (RotationIncrement(), RotationIncrement(0.0, -0.1, "", np.ones(3))),
         },
     ),
+    MissedPassages: lambda _: Case(
+        MissedPassages(probability=0.5), {"detections": (detections(0.0), detections(0.01, 3.0))}
+    ),
+    PoseOutliers: lambda _: Case(PoseOutliers(probability=0.5, angle=0.1), {"pose": ESTIMATES}),
+    PoseFromVector: lambda _: Case(
+        PoseFromVector(), {"vector": vector(1.0, 0.1, 0.2, 0.3, 1.0, 2.0, 3.0)}
+    ),
+    PoseToVector: lambda _: Case(PoseToVector(), {"pose": POSES}),
+    RelativePose: relative_pose,
+    MarkersSeen: lambda _: Case(
+        MarkersSeen(marker_map=MAP, rate=60.0),
+        {"detections": (detections(0.0), detections(0.5, 3.0))},
+    ),
+    PoseChain: lambda _: Case(
+        PoseChain(mounts=[RigidTransform([0.0, 0.0, 0.1])]),
+        {
+            "pose_1": POSES,
+            "covariance_1": vector(*(1e-4 * np.eye(6).ravel())),
+            "pose_2": POSES,
+            "covariance_2": vector(*(1e-4 * np.eye(6).ravel())),
+        },
+    ),
     ProgressMonitor: lambda _: Case(
         ProgressMonitor(),
         {
@@ -468,6 +549,14 @@ CASES: dict[type, Callable[[Path], Case]] = {
         {"input": vector(1.0, 2.0, 3.0)},
     ),
     Recorder: recorder,
+    RockingBody: lambda _: Case(
+        RockingBody(parameters=RockingParameters(bound=0.1), frame_id=WORLD),
+        {
+            "pose": POSES,
+            "spatial_velocity": vector(0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
+            "spatial_acceleration": vector(0.6, 0.5, 0.4, 0.3, 0.2, 0.1),
+        },
+    ),
     RenderedCamera: lambda _: Case(
         RenderedCamera(
             camera=CAMERA,
@@ -524,6 +613,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "imu": vector(0.1, 0.2, 0.3, 0.0, 0.0, 9.81),
         },
     ),
+    ShellViewer: shell_viewer,
     SurroundingsViewer: surroundings_viewer,
     TwinPositions: twin_positions,
     TwinState: lambda _: Case(
@@ -707,6 +797,8 @@ def simulate(case: Case, duration: float = 0.25) -> Context:
 def same(a: Any, b: Any) -> bool:
     if isinstance(a, RigidTransform):
         return a.IsExactlyEqualTo(b)
+    if isinstance(a, FramePoseVector):
+        return {*a.ids()} == {*b.ids()} and all(same(a.value(f), b.value(f)) for f in a.ids())
     if isinstance(a, list):
         return len(a) == len(b) and all(map(same, a, b))
     if isinstance(a, ExternallyAppliedSpatialForce):
@@ -723,9 +815,18 @@ def same(a: Any, b: Any) -> bool:
     return a == b
 
 
+def copied(value: Any) -> Any:
+    """A copy: what Eval returns is the cache's own, which changes with the inputs."""
+    if not isinstance(value, FramePoseVector):  # which Python cannot copy
+        return copy.deepcopy(value)
+    poses = FramePoseVector()
+    for frame in value.ids():
+        poses.set_value(frame, value.value(frame))
+    return poses
+
+
 def outputs(system: LeafSystem, context: Context) -> dict[str, Any]:
-    # Copies: what Eval returns is the cache's own, which changes with the inputs.
-    return {port.get_name(): copy.deepcopy(port.Eval(context)) for port in ports(system)["output"]}
+    return {port.get_name(): copied(port.Eval(context)) for port in ports(system)["output"]}
 
 
 @every_system

@@ -67,6 +67,7 @@ class CameraDriver(ABC):
         calibration: camera file (bundled, or beside the scenario).
         rate: pictures a second, Hz.
         latency: from the middle of the exposure to the arrival of the picture, s.
+        clock_error: its stamps are so late, s; at most its latency.
         sight: `rendered`, `drawn` or `projected`; left out, the scenario's.
         effects: what lens and sensor do to pictures.
         detector: how markers are found in pictures.
@@ -76,6 +77,7 @@ class CameraDriver(ABC):
     calibration: Annotated[str, File("cameras")]
     rate: float = 15.0
     latency: float = 0.0
+    clock_error: float = 0.0
     sight: Literal["rendered", "drawn", "projected"] | None = None
     effects: ImageEffects = field(default_factory=ImageEffects)
     detector: DetectorParameters = field(default_factory=DetectorParameters)
@@ -83,7 +85,13 @@ class CameraDriver(ABC):
 
     def __post_init__(self) -> None:
         require_positive(rate=self.rate)
-        require_non_negative(latency=self.latency)
+        require_non_negative(latency=self.latency, clock_error=self.clock_error)
+        require(
+            self.clock_error <= self.latency,
+            "clock_error",
+            self.clock_error,
+            f"at most the latency, {self.latency:g} s: pictures do not come from the future",
+        )
 
     def model(self) -> PinholeCamera:
         """Returns the calibrated camera."""
@@ -135,7 +143,12 @@ class CameraDriver(ABC):
             station.add(health, f"{name}.no_health")
             station.export_output(health.get_output_port(), f"{name}.health")
         station.export_output(image, images.port, images)
-        station.export_output(detections, found.port, found)
+        station.export_output(self._seen(station, name, detections), found.port, found)
+
+    def _seen(self, station: StationBuilder, name: str, detections: OutputPort) -> OutputPort:
+        """Returns the port of the detections as the robot gets them: all, unless one knows more."""
+        del station, name
+        return detections
 
     def _check_recorded_size(
         self, station: StationBuilder, name: str, camera: PinholeCamera
@@ -155,6 +168,11 @@ class CameraDriver(ABC):
                     f"{camera.height}: {topic} of the recording is of {width}x{height}"
                 )
 
+    def _plays_pictures(self, station: StationBuilder, name: str) -> bool:
+        """Whether the recording that is played has pictures, for the detector to look at."""
+        assert station.player is not None
+        return image_signal(name, self.rate).topic in station.player.topics()
+
     def _sources(
         self, station: StationBuilder, robot: Robot, name: str, camera: PinholeCamera
     ) -> tuple[OutputPort | None, OutputPort | None]:
@@ -164,9 +182,8 @@ class CameraDriver(ABC):
         """
         if not station.simulated:
             self._check_recorded_size(station, name, camera)
-            image = station.play(image_signal(name, self.rate), optional=True)
-            if image is not None:
-                return image, None
+            if self._plays_pictures(station, name):
+                return station.play(image_signal(name, self.rate)), None
             return None, station.play(detections_signal(name, self.rate))
         view = self.view(station, robot)
         shared: dict[str, Any] = {
@@ -175,6 +192,7 @@ class CameraDriver(ABC):
             "X_PC": view.X_BC,
             "rate": self.rate,
             "latency": self.latency,
+            "clock_error": self.clock_error,
             "seed": station.seed,
             "name": name,
             "frame_id": name.replace(".", "/"),

@@ -10,7 +10,7 @@ import numpy as np
 from diagrams.channels import imu_signal
 from diagrams.station import Robot, StationBuilder
 from systems.estimators.gyro_yaw import GyroYaw
-from systems.sensors.imu import Imu, ImuParameters, Mpu6050Parameters
+from systems.sensors.imu import Bmi088Parameters, Imu, ImuParameters, Mpu6050Parameters
 from systems.validation import require, require_non_negative, require_positive
 
 
@@ -85,3 +85,12 @@ class Mpu6050(InertialSensor):
 
     parameters: Mpu6050Parameters = field(default_factory=Mpu6050Parameters)
     calibration: float = 1.0
+
+
+@dataclass
+class Bmi088(InertialSensor):
+    """The BMI088, by its data sheet, in base_link's origin; the estimator finds its offsets."""
+
+    parameters: Bmi088Parameters = field(default_factory=Bmi088Parameters)
+    rate: float = 300.0
+    position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])

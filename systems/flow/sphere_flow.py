@@ -31,6 +31,9 @@ REASONS = ("bad_matches", "bad_point", "few_points", "no_agreement")
 # Of the information about the three axes, least over most: points within a few hundredths of a
 # pixel do not tell a turn.
 _LEAST_SPREAD = 1e-10
+_STEPS = 3  # of Newton's method at most
+_SETTLED = 1e-8  # rad, a step after which no other is worth its time: less than 1e-4 px
+_NEARLY_ALL = 0.9  # part of the points that makes a search among pairs needless
 _STREAM = stream_key(0, "samples of sphere flow")
 
 
@@ -168,14 +171,13 @@ class SphereFlowEstimator:
         if len(before) < p.min_inliers:
             dropped["few_points"] = 1
             return SphereFit(nothing, dropped)
-        random = generator(_STREAM, round(abs(matches.stamp) * 1e9))
-        inliers = np.asarray(self._consensus(before, after, random))
+        inliers = self._consensus(before, after, matches.stamp)
         enough = max(p.min_inliers, p.min_inlier_share * len(before))
         if inliers.sum() < enough:
             dropped["no_agreement"] = 1
             return SphereFit(nothing, dropped)
         R_B2B1 = kabsch(before[inliers], after[inliers])
-        for _ in range(3):
+        for _ in range(_STEPS):
             turned = before @ R_B2B1.T
             predicted, jacobian = _pixels_and_jacobian(self.view, turned)
             error = pixels - predicted
@@ -191,6 +193,8 @@ class SphereFlowEstimator:
                 return SphereFit(nothing, dropped)
             step = np.linalg.solve(information, J.T @ e)
             R_B2B1 = rotation_from_vector(-step) @ R_B2B1
+            if step @ step < _SETTLED**2:
+                break
         rest = e - J @ step
         variance = max(p.pixel_noise**2, float(rest @ rest) / (len(rest) - 3))
         count = int(inliers.sum())
@@ -205,23 +209,30 @@ class SphereFlowEstimator:
         )
         return SphereFit(increment, dropped)
 
-    def _consensus(
-        self, before: Array, after: Array, random: np.random.Generator
-    ) -> NDArray[np.bool_]:
-        """Returns which points (n,) agree with the best of the rotations of random pairs."""
+    def _consensus(self, before: Array, after: Array, stamp: float) -> NDArray[np.bool_]:
+        """Returns which points (n,) agree with a rotation that most agree with.
+
+        That of all points, if nearly all agree with it; else the best of those of random pairs.
+        """
         p, view = self.parameters, self.view
-        n = len(before)
-        first = random.integers(0, n, p.hypotheses)
-        second = (first + random.integers(1, n, p.hypotheses)) % n
-        pairs = np.stack([first, second], axis=1)
-        R = pair_rotations(before[pairs] / view.radius, after[pairs] / view.radius)
         # On the shell, a pixel is this long in the middle of the picture. The limit is doubled as
         # two points give a rough rotation.
         focal = min(view.camera.K[0, 0], view.camera.K[1, 1])
         limit = 2 * p.inlier_px * view.parameters.camera_height / focal
-        # |R a - b|^2 = 2 (r^2 - b'R a), and all b'R a are one product of matrices.
+        # |R a - b|^2 = 2 (r^2 - b'R a).
+        least = view.radius**2 - limit**2 / 2
+        together = ((before @ kabsch(before, after).T) * after).sum(axis=1) > least
+        if together.mean() >= _NEARLY_ALL:
+            return np.asarray(together, bool)
+        n = len(before)
+        random = generator(_STREAM, round(abs(stamp) * 1e9))
+        first = random.integers(0, n, p.hypotheses)
+        second = (first + random.integers(1, n, p.hypotheses)) % n
+        pairs = np.stack([first, second], axis=1)
+        R = pair_rotations(before[pairs] / view.radius, after[pairs] / view.radius)
+        # All b'R a are one product of matrices.
         products = (after[:, :, None] * before[:, None, :]).reshape(n, 9)
-        agree = products @ R.reshape(-1, 9).T > view.radius**2 - limit**2 / 2
+        agree = products @ R.reshape(-1, 9).T > least
         best: NDArray[np.bool_] = agree[:, np.argmax(agree.sum(axis=0))]
         return best
 

@@ -1,0 +1,166 @@
+"""The world of robots that climb robots: a shell that stands or moves, and those on backs."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import FrameId
+from pydrake.math import RigidTransform
+from pydrake.multibody.tree import ModelInstanceIndex
+
+from diagrams.schema import File, ScenarioError, file_path
+from diagrams.world import World
+from plants.magnets import JoinForces
+from plants.shell import (
+    BODY,
+    ShellMotion,
+    ShellMotionParameters,
+    ShellParameters,
+    add_moving_shell,
+    add_shell,
+)
+from plants.shell_surface import add_shell_surface
+from systems.drawing import shells as drawing
+from systems.markers.layout import MarkerMap, load_map
+from systems.shell.layout import check_on_shell, misplaced, shell_markers
+from systems.validation import require_non_negative
+
+if TYPE_CHECKING:
+    from diagrams.station import Robot, StationBuilder
+
+REFERENCE = "reference"  # name of the shell that carries all others
+
+
+@dataclass(frozen=True, eq=False)
+class Shell:
+    """A shell of a station.
+
+    Attributes:
+        name: of who has it.
+        model: its instance in the plant.
+        frame_id: geometry frame of its frame R.
+        X_WR: where it is at the start.
+        markers: on it, as they are, in R.
+    """
+
+    name: str
+    model: ModelInstanceIndex
+    frame_id: FrameId
+    X_WR: RigidTransform
+    markers: MarkerMap
+
+
+@dataclass
+class ShellWorldParameters(World):
+    """The reference robot, and what all shells are like.
+
+    Attributes:
+        shell: radius, mass and friction.
+        markers: a marker map's file (bundled, or beside the scenario), in the shell's frame: what
+            the robots believe. Left out, the paper's 25 on a shell of this radius.
+        placement_tolerance_deg: the seed shifts and turns each marker on the sphere by up to so
+            much about each of three axes (see `systems.shell.layout.misplaced`).
+        motion: how the reference robot moves; left out, it stands.
+        looks: the steel, its holes, the print.
+    """
+
+    shell: ShellParameters = field(default_factory=ShellParameters)
+    markers: Annotated[str, File("maps")] | None = None
+    placement_tolerance_deg: float = 0.0
+    motion: ShellMotionParameters | None = None
+    looks: drawing.ShellParameters = field(default_factory=drawing.ShellParameters)
+
+    def __post_init__(self) -> None:
+        require_non_negative(placement_tolerance_deg=self.placement_tolerance_deg)
+        where = "the paper's markers" if self.markers is None else f"marker map {self.markers}"
+        try:
+            check_on_shell(self.marker_map(), self.shell.radius)
+        except ScenarioError:
+            raise
+        except ValueError as error:
+            raise ValueError(f"{where}: {error}") from error
+
+    def resources(self) -> dict[str, Any]:
+        """Returns the shell, which a body is made for."""
+        return {"shell": self.shell}
+
+    def marker_map(self) -> MarkerMap:
+        """Returns the markers of a shell as the robots believe them to be, in its frame."""
+        if self.markers is None:
+            return shell_markers(radius=self.shell.radius)
+        return load_map(file_path(self.markers, "maps"))
+
+    def true_markers(self, seed: int) -> MarkerMap:
+        """Returns the markers of a shell as they are; each seed has its own."""
+        bound = math.radians(self.placement_tolerance_deg)
+        return misplaced(self.marker_map(), bound=bound, seed=seed)
+
+    def view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Returns a place beside the reference robot's shell and above, and its middle."""
+        r = self.shell.radius
+        return r * np.array([2.2, -1.9, 2.0]), np.zeros(3)
+
+    def add_models(self, station: StationBuilder) -> None:
+        """Adds the reference robot."""
+        plant = station.plant
+        add = add_moving_shell if self.motion is not None and station.simulated else add_shell
+        model = add(plant, self.shell, REFERENCE, plain=False)
+        self.finish_shell(station, REFERENCE, model, RigidTransform(), station.true_markers)
+
+    def finish_shell(
+        self,
+        station: StationBuilder,
+        name: str,
+        model: ModelInstanceIndex,
+        X_WR: RigidTransform,
+        markers: MarkerMap,
+    ) -> None:
+        """Gives a shell its looks, and makes it known by the name of who has it.
+
+        Args:
+            station: its plant is not finalized yet.
+            name: of the robot that has it.
+            model: its instance in the plant, without looks.
+            X_WR: where it is at the start.
+            markers: on it, as they are.
+        """
+        body = station.plant.GetBodyByName(BODY, model)
+        add_shell_surface(
+            station.plant,
+            body,
+            radius=self.shell.radius,
+            markers=markers,
+            parameters=self.looks,
+            rendered=station.sight == "rendered",
+        )
+        frame_id = station.plant.GetBodyFrameIdOrThrow(body.index())
+        station.shells[name] = Shell(name, model, frame_id, X_WR, markers)
+
+    def add_blocks(self, station: StationBuilder, robots: list[Robot]) -> None:
+        """Moves the reference robot, and lets the magnets pull."""
+        del robots
+        if not station.simulated:
+            return
+        forces = station.plant.get_applied_spatial_force_input_port()
+        if len(station.pulls) == 1:
+            station.connect(station.pulls[0], forces)
+        else:
+            joined = station.add(JoinForces(robots=len(station.pulls)), "magnets")
+            for k, pull in enumerate(station.pulls, start=1):
+                station.connect(pull, joined.GetInputPort(f"forces_{k}"))
+            station.connect(joined.forces_output_port(), forces)
+        if self.motion is not None:
+            motion = station.add(ShellMotion(parameters=self.motion), f"{REFERENCE}.motion")
+            model = station.shells[REFERENCE].model
+            station.connect(
+                motion.desired_state_output_port(),
+                station.plant.get_desired_state_input_port(model),
+            )
+            station.export_output(motion.pose_output_port(), f"{REFERENCE}.pose")
+            station.export_output(
+                motion.spatial_velocity_output_port(), f"{REFERENCE}.spatial_velocity"
+            )

@@ -1,0 +1,63 @@
+"""Where one frame of a scene is as seen from another: the truth about a robot on a robot."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import FrameId, QueryObject
+from pydrake.math import RigidTransform
+from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
+
+
+class RelativePose(LeafSystem):
+    """Gives the pose of one frame of a SceneGraph in another.
+
+    .. pydrake_system::
+
+        name: RelativePose
+        input_ports:
+        - query_object
+        output_ports:
+        - pose
+
+    Args:
+        parent: geometry frame P.
+        child: geometry frame C.
+        X_CF: pose of the frame F that is asked for, in the child; identity for the child itself.
+
+    Ports:
+        query_object (input, QueryObject): SceneGraph's `query`.
+        pose (output, RigidTransform): `X_PF`.
+    """
+
+    def __init__(
+        self, *, parent: FrameId, child: FrameId, X_CF: RigidTransform | None = None
+    ) -> None:
+        super().__init__()
+        self._parent = parent
+        self._child = child
+        self._X_CF = X_CF
+        self._query_input = self.DeclareAbstractInputPort(
+            "query_object", AbstractValue.Make(QueryObject())
+        )
+        self._pose_output = self.DeclareAbstractOutputPort(
+            "pose",
+            lambda: AbstractValue.Make(RigidTransform()),
+            self._calc_pose,
+            {self._query_input.ticket()},
+        )
+
+    def query_object_input_port(self) -> InputPort:
+        """Returns the port of SceneGraph's geometry."""
+        return self._query_input
+
+    def pose_output_port(self) -> OutputPort:
+        """Returns the port of the pose."""
+        return self._pose_output
+
+    def _calc_pose(self, context: Context, output: Any) -> None:
+        query = self._query_input.Eval(context)
+        X_WP, X_WC = (query.GetPoseInWorld(frame) for frame in (self._parent, self._child))
+        X_PC = X_WP.inverse() @ X_WC
+        output.set_value(X_PC if self._X_CF is None else X_PC @ self._X_CF)

@@ -1,0 +1,76 @@
+"""How many markers a robot has met, and whether it sees one now."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+
+from systems.markers.layout import MarkerMap
+from systems.messages import Detections
+from systems.validation import require_positive
+
+Array = NDArray[np.float64]
+
+
+class MarkersSeen(LeafSystem):
+    """Counts the markers of a map that detections have shown so far.
+
+    .. pydrake_system::
+
+        name: MarkersSeen
+        input_ports:
+        - detections
+        output_ports:
+        - seen
+
+    Args:
+        marker_map: which markers count.
+        rate: how often it looks, Hz; at least the camera's.
+
+    Ports:
+        detections (input, Detections): of the camera.
+        seen (output, vector of 3): whether the latest picture shows a marker of the map (1 or 0),
+            the number of different ones so far, and the share of pictures so far that showed one
+            (0 before the first picture); at `rate`.
+
+    Raises:
+        ValueError: rate out of range.
+    """
+
+    def __init__(self, *, marker_map: MarkerMap, rate: float) -> None:
+        super().__init__()
+        require_positive(rate=rate)
+        self._ids = np.array(sorted(marker_map.markers))
+        self._detections_input = self.DeclareAbstractInputPort(
+            "detections", AbstractValue.Make(Detections())
+        )
+        self._met = self.DeclareDiscreteState(len(self._ids))
+        # Whether one is in view, how many were met, the share; then stamp, pictures, with a marker.
+        self._seen = self.DeclareDiscreteState([0.0, 0.0, 0.0])
+        self._pictures = self.DeclareDiscreteState([math.nan, 0.0, 0.0])
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        self._seen_output = self.DeclareStateOutputPort("seen", self._seen)
+
+    def detections_input_port(self) -> InputPort:
+        """Returns the port of the detections."""
+        return self._detections_input
+
+    def seen_output_port(self) -> OutputPort:
+        """Returns the port of what was seen."""
+        return self._seen_output
+
+    def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
+        detections: Detections = self._detections_input.Eval(context)
+        stamp, pictures, shown = context.get_discrete_state(self._pictures).get_value()
+        if math.isnan(detections.stamp) or detections.stamp == stamp:
+            return
+        known = np.isin(self._ids, detections.ids)
+        met = np.maximum(context.get_discrete_state(self._met).get_value(), known)
+        pictures, shown = pictures + 1, shown + known.any()
+        discrete_state.set_value(self._met, met)
+        discrete_state.set_value(self._pictures, [detections.stamp, pictures, shown])
+        discrete_state.set_value(self._seen, [float(known.any()), met.sum(), shown / pictures])
