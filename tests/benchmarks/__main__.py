@@ -13,6 +13,7 @@ from tests.benchmarks import (
     bench_pose,
     bench_run,
     bench_shell_ekf,
+    bench_snailbot,
 )
 from tests.benchmarks.table import show
 
@@ -27,5 +28,6 @@ for title, module in (
     ("Attitude filter", bench_madgwick),
     ("Filter of the pose on the shell", bench_shell_ekf),
     ("Navigation robot", bench_run),
+    ("SnailBot", bench_snailbot),
 ):
     show(title, module.rows())
