@@ -100,13 +100,10 @@ class Wiring:
 
     def has_output(self, name: str) -> bool:
         """Whether there is such an output port."""
-        if name in self._watched:
+        if name in self._watched or name in _port_names(self.station, "Output"):
             return True
-        try:
-            self.output(name)
-        except ScenarioError:
-            return False
-        return True
+        block, _, port = name.partition(".")
+        return block in self._blocks and port in _port_names(self._blocks[block], "Output")
 
     def has_block(self, name: str) -> bool:
         """Whether a block was added under that name."""

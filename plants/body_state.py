@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import AbstractValue
-from pydrake.math import RigidTransform
+from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
@@ -80,9 +80,12 @@ class BodyState(LeafSystem):
         )
 
     def _calc_pose(self, context: Context, output: Any) -> None:
-        w, i, j, k, *p = self._state_input.Eval(context)[:7].tolist()
+        state = self._state_input.Eval(context)
+        w, i, j, k = state[:4].tolist()
         n = math.sqrt(w * w + i * i + j * j + k * k)
-        output.set_value(RigidTransform(Quaternion(w / n, i / n, j / n, k / n), p))
+        # From an array and a rotation matrix at once: of anything else pydrake makes these first.
+        R_WB = RotationMatrix(Quaternion(w / n, i / n, j / n, k / n))
+        output.set_value(RigidTransform(R_WB, state[4:7]))
 
     def _calc_planar_pose(self, context: Context, output: Any) -> None:
         w, i, j, k, x, y = self._state_input.Eval(context)[:6].tolist()

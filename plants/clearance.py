@@ -148,7 +148,9 @@ class ClearanceMonitor(LeafSystem):
         output.SetFromVector(context.get_discrete_state(self._state).get_value()[:1])
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
-        count, *touching = context.get_discrete_state(self._state).get_value()
+        count, *touching = context.get_discrete_state(self._state).get_value().tolist()
+        if not any(touching) and self._clearance_output.Eval(context)[0] > self._tolerance:
+            return
         before = np.array(touching, bool)
         distances = self._distances_output.Eval(context)
         now = touches(distances, before, self._tolerance, self._release)

@@ -10,6 +10,7 @@ Detection", 2005, 4.4 and 5.2). Points of the plane are complex numbers here: a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from typing import Self
 
@@ -40,19 +41,16 @@ class PlanarShapes:
         self._set(
             xy[:, 0] + 1j * xy[:, 1],
             np.exp(1j * np.asarray(headings, float).reshape(-1)),
-            half[:, 0],
-            half[:, 1],
+            half,
             np.asarray(radii, float).reshape(-1),
         )
 
-    def _set(
-        self, centres: ComplexArray, turns: ComplexArray, length: Array, width: Array, radii: Array
-    ) -> None:
+    def _set(self, centres: ComplexArray, turns: ComplexArray, halves: Array, radii: Array) -> None:
         self._centres = centres
         self._turns = turns
-        self._length = length  # halves
-        self._width = width
+        self._halves = halves  # (n, 2) of length and width
         self._radii = radii
+        length, width = halves.T
         corners = _CORNERS.real[:, None] * length + 1j * _CORNERS.imag[:, None] * width
         self._corners = corners * turns  # (4, n) about the centres
 
@@ -73,7 +71,7 @@ class PlanarShapes:
     def joined(cls, parts: Iterable[PlanarShapes]) -> Self:
         """Returns all shapes of the parts in one."""
         parts = list(parts)
-        names = ("_centres", "_turns", "_length", "_width", "_radii")
+        names = ("_centres", "_turns", "_halves", "_radii")
         joined = cls(centres=[], headings=[], sizes=[], radii=[])
         if parts:
             joined._set(*(np.concatenate([getattr(p, name) for p in parts]) for name in names))
@@ -86,7 +84,7 @@ class PlanarShapes:
             pose: [x (m), y (m), theta (rad)] of the body.
         """
         x, y, theta = (float(value) for value in pose)
-        turn = complex(np.cos(theta), np.sin(theta))
+        turn = complex(math.cos(theta), math.sin(theta))
         moved = type(self).__new__(type(self))
         moved.__dict__ |= self.__dict__
         moved._centres = self._centres * turn + complex(x, y)
@@ -107,11 +105,20 @@ class PlanarShapes:
         It is negative where they overlap, by the length of the shortest push that parts them.
         """
         between = others._centres - self._centres[:, None]  # (n, m)
-        gap, apart = _corners_to_cores(between, others, self)
-        other_gap, other_apart = _corners_to_cores(-between.T, self, others)
-        gap = np.maximum(gap, other_gap.T)
-        cores = np.where(gap > 0, np.minimum(apart, other_apart.T), gap)
-        return np.asarray(cores - self._radii[:, None] - others._radii)
+        # The corners of each shape, seen from the frame of the other's core, and the other way.
+        corners = np.empty((2, 4, *between.shape), complex)
+        corners[0] = (between + others._corners[:, None]) * self._turns.conj()[:, None]
+        corners[1] = (self._corners[:, :, None] - between) * others._turns.conj()
+        cores = np.empty((2, 1, *between.shape, 2))
+        cores[0, 0] = self._halves[:, None]
+        cores[1, 0] = others._halves
+        xy = corners.view(float).reshape(*corners.shape, 2)
+        # Far to one side or the other: corners are symmetric about their centre, which is not zero.
+        beyond = np.maximum(xy.min(axis=1), -xy.max(axis=1)) - cores[:, 0]
+        gap = beyond.max(axis=(0, 3))
+        outside = np.maximum(np.abs(xy) - cores, 0)
+        apart = np.sqrt((outside * outside).sum(axis=4).min(axis=(0, 1)))
+        return np.where(gap > 0, apart, gap) - self._radii[:, None] - others._radii
 
     def distances_from(self, points: Array) -> Array:
         """Returns the distance of each shape from each of the points (m, 2), (n, m) m.
@@ -120,33 +127,7 @@ class PlanarShapes:
         """
         between = points[:, 0] + 1j * points[:, 1] - self._centres[:, None]
         local = between * self._turns.conj()[:, None]
-        x = np.abs(local.real) - self._length[:, None]
-        y = np.abs(local.imag) - self._width[:, None]
+        x = np.abs(local.real) - self._halves[:, :1]
+        y = np.abs(local.imag) - self._halves[:, 1:]
         outside = np.hypot(np.maximum(x, 0), np.maximum(y, 0))
         return np.asarray(outside + np.minimum(np.maximum(x, y), 0) - self._radii[:, None])
-
-
-def _corners_to_cores(
-    between: ComplexArray, shapes: PlanarShapes, cores: PlanarShapes
-) -> tuple[Array, Array]:
-    """Looks at the corners of shapes from the frames of other shapes' cores.
-
-    Args:
-        between: (n, m) from the centre of each core to that of each shape.
-        shapes: (m,) whose corners are meant.
-        cores: (n,).
-
-    Returns:
-        The widest gap along the normals of the core's sides, and the distance of the nearest
-        corner from the core, (n, m) m; the latter holds for cores that are apart.
-    """
-    corners = (between + shapes._corners[:, None, :]) * cores._turns.conj()[:, None]  # (4, n, m)
-    # Far to one side or the other: corners are symmetric about their centre, which is not zero.
-    x, y = corners.real, corners.imag
-    length, width = cores._length[:, None], cores._width[:, None]
-    beyond_x = np.maximum(x.min(axis=0), -x.max(axis=0)) - length
-    beyond_y = np.maximum(y.min(axis=0), -y.max(axis=0)) - width
-    dx = np.maximum(np.abs(x) - length, 0)
-    dy = np.maximum(np.abs(y) - width, 0)
-    apart = np.sqrt((dx * dx + dy * dy).min(axis=0))
-    return np.maximum(beyond_x, beyond_y), apart

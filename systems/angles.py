@@ -6,7 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from pydrake.math import RigidTransform, RollPitchYaw
+from pydrake.math import RigidTransform, RotationMatrix
 
 
 def wrap(angle: Any) -> Any:
@@ -25,4 +25,5 @@ def planar_pose(X_WB: RigidTransform) -> np.ndarray:
 
 def spatial_pose(pose: np.ndarray, z: float = 0.0) -> RigidTransform:
     """Returns the `RigidTransform` of a planar pose [x, y, theta] at height z (m)."""
-    return RigidTransform(RollPitchYaw(0.0, 0.0, float(pose[2])), [pose[0], pose[1], z])
+    R = RotationMatrix.MakeZRotation(float(pose[2]))
+    return RigidTransform(R, np.array([pose[0], pose[1], z]))

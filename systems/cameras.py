@@ -176,22 +176,19 @@ class PinholeCamera:
 
     def _distort(self, normalised: Array) -> tuple[Array, Array]:
         """Applies plumb-bob distortion to (..., 2); also returns its (..., 2, 2) derivative."""
-        k1, k2, p1, p2, k3 = self.D
+        k1, k2, p1, p2, k3 = self.D.tolist()
         x, y = normalised[..., 0], normalised[..., 1]
-        r2 = x * x + y * y
+        xx, yy, xy = x * x, y * y, x * y
+        r2 = xx + yy
         radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
         slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial = slope (x dx + y dy)
-        distorted = np.stack(
-            [
-                x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
-                y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
-            ],
-            axis=-1,
-        )
+        distorted = np.empty(normalised.shape)
+        distorted[..., 0] = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * xx)
+        distorted[..., 1] = y * radial + 2 * p2 * xy + p1 * (r2 + 2 * yy)
         jacobian = np.empty((*x.shape, 2, 2))
-        jacobian[..., 0, 0] = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-        jacobian[..., 1, 1] = radial + slope * y * y + 2 * p2 * x + 6 * p1 * y
-        jacobian[..., 0, 1] = jacobian[..., 1, 0] = slope * x * y + 2 * (p1 * x + p2 * y)
+        jacobian[..., 0, 0] = radial + slope * xx + 2 * p1 * y + 6 * p2 * x
+        jacobian[..., 1, 1] = radial + slope * yy + 2 * p2 * x + 6 * p1 * y
+        jacobian[..., 0, 1] = jacobian[..., 1, 0] = slope * xy + 2 * (p1 * x + p2 * y)
         return distorted, jacobian
 
     def to_drake(self) -> CameraInfo:

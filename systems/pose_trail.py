@@ -24,7 +24,10 @@ def empty_trail(*, duration: float, rate: float) -> Array:
 
 def remember(trail: Array, t: float, pose: Array) -> Array:
     """Returns the trail with a pose (3,) added at its end and the oldest one dropped."""
-    return np.vstack([trail[1:], [t, *pose]])
+    longer = np.empty_like(trail)
+    longer[:-1] = trail[1:]
+    longer[-1] = t, *pose
+    return longer
 
 
 def poses_at(trail: Array, times: Array) -> Array:
@@ -36,8 +39,13 @@ def poses_at(trail: Array, times: Array) -> Array:
     known = trail[np.isfinite(trail).all(axis=1)]
     if len(known) == 0:
         return np.full((len(times), 3), np.nan)
-    columns = (known[:, 1], known[:, 2], np.unwrap(known[:, 3]))
-    return np.stack([np.interp(times, known[:, 0], column) for column in columns], axis=-1)
+    t, x, y, theta = known.T
+    if (np.abs(theta[1:] - theta[:-1]) > np.pi).any():
+        theta = np.unwrap(theta)
+    poses = np.empty((len(times), 3))
+    for k, column in enumerate((x, y, theta)):
+        poses[:, k] = np.interp(times, t, column)
+    return poses
 
 
 def ray_poses(scan: Scan, lidar_pose: Array, trail: Array) -> Array:
@@ -55,4 +63,6 @@ def ray_poses(scan: Scan, lidar_pose: Array, trail: Array) -> Array:
     c, s = np.cos(body[:, 2]), np.sin(body[:, 2])
     x = body[:, 0] + c * lidar_pose[0] - s * lidar_pose[1]
     y = body[:, 1] + s * lidar_pose[0] + c * lidar_pose[1]
-    return np.stack([x, y, body[:, 2] + lidar_pose[2] + scan.angles], axis=-1)
+    rays = np.empty((len(scan), 3))
+    rays[:, 0], rays[:, 1], rays[:, 2] = x, y, body[:, 2] + lidar_pose[2] + scan.angles
+    return rays

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
@@ -91,11 +91,9 @@ class SearchWhenLost(LeafSystem):
         return self._counts.output_port
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
-        covariance = self._covariance_input.Eval(context).reshape(3, 3)[:2, :2]
-        lost = not (
-            np.isfinite(covariance).all()
-            and np.linalg.eigvalsh(covariance)[-1] <= self._parameters.max_position_std**2
-        )
+        xx, _, _, xy, yy = self._covariance_input.Eval(context)[:5].tolist()
+        largest = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)
+        lost = not largest <= self._parameters.max_position_std**2
         duration = context.get_discrete_state(self._duration)[0]
         discrete_state.set_value(self._duration, [duration + self._period if lost else 0.0])
         self._counts.add(context, discrete_state, lost=lost)

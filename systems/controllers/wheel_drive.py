@@ -119,8 +119,8 @@ class WheelDrive(LeafSystem):
         if context.get_time() < self._rest:
             command = np.zeros(2)
         sent = context.get_discrete_state(self._sent).get_value()
-        wanted = self._within_reach(np.clip(command, -self._limit, self._limit))
-        changed = sent + np.clip(wanted - sent, -self._change, self._change)
+        wanted = self._within_reach(np.minimum(np.maximum(command, -self._limit), self._limit))
+        changed = sent + np.minimum(np.maximum(wanted - sent, -self._change), self._change)
         # Once more: on its way from one to the other it may leave what the wheels can do.
         discrete_state.set_value(self._sent, self._within_reach(changed))
 

@@ -128,8 +128,8 @@ class BagWriter:
         except Exception as error:  # whatever a wrong field trips in the compiled serialiser
             raise ValueError(f"message on {topic} is no {msgtype}: {first_line(error)}") from error
         failure: OSError | None = None
-        if time // self._chunk_length != self._chunk:
-            self._chunk = time // self._chunk_length
+        if (chunk := time // self._chunk_length) != self._chunk:
+            self._chunk = chunk
             try:
                 self.flush()
             except OSError as error:
@@ -137,6 +137,10 @@ class BagWriter:
         self._mcap.add_message(channel, time, data)
         if failure is not None:
             raise failure
+
+    def chunk(self, log_time: float) -> int:
+        """Returns which chunk a message of this time (s) goes into; another one ends the last."""
+        return nanoseconds(log_time) // self._chunk_length
 
     def flush(self) -> None:
         """Ends the chunk and writes it.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -93,7 +94,8 @@ class Recorder(LeafSystem):
 
     The file is outside of the Context: a recorder has no influence on the simulation. What cannot
     be written, for want of space or because it does not fit its message, is counted in `lost`; the
-    first of each kind is logged in one line, and the simulation goes on.
+    first of each kind is logged in one line, and the simulation goes on. That shows when the chunk
+    ends, since only then what was looked at is written.
 
     Raises:
         ValueError: no channel, or two of one port.
@@ -113,6 +115,10 @@ class Recorder(LeafSystem):
         self._writer = writer
         self._static = dict(static or {})
         self._refused = 0
+        # Made into ROS messages when a chunk begins, all at once: one after the other, between
+        # what else a simulation does, takes twice as long.
+        self._waiting: list[tuple[str, Encoder, Any, float]] = []
+        self._chunk: int | None = None
         self._warned: set[str] = set()
         # What the file holds already is the file's state, not the diagram's.
         self._written_stamps: dict[str, float] = {}
@@ -131,11 +137,12 @@ class Recorder(LeafSystem):
 
     @property
     def lost(self) -> int:
-        """Messages that were to be recorded and are not in the file."""
+        """Messages that were to be recorded and are not in the file; final when it is closed."""
         return self._refused + self._writer.lost
 
     def close(self) -> None:
         """Writes what is outstanding and closes the recording; a full disk is logged."""
+        self._write_waiting()
         try:
             self._writer.close()
         except OSError as error:
@@ -163,12 +170,22 @@ class Recorder(LeafSystem):
                 if stamp == self._written_stamps.get(channel.port):
                     continue
                 self._written_stamps[channel.port] = stamp
+            # Of a pose Drake shows the one in its cache, which will change.
+            self._waiting.append((channel.topic, encode, copy(value), t))
+        chunk = self._writer.chunk(t)
+        if chunk != self._chunk:
+            self._chunk = chunk
+            self._write_waiting()
+
+    def _write_waiting(self) -> None:
+        waiting, self._waiting = self._waiting, []
+        for topic, encode, value, t in waiting:
             try:
                 message = encode(value, t)
             except ValueError as error:
-                self._refuse(channel.topic, error)
+                self._refuse(topic, error)
                 continue
-            self._write(channel.topic, message.__msgtype__, message, t)
+            self._write(topic, message.__msgtype__, message, t)
 
     def _write(
         self, topic: str, msgtype: str, message: Any, t: float, latched: bool = False

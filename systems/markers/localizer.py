@@ -113,15 +113,8 @@ class _View:
 
     def errors_by_marker(self, R: Array, p: Array) -> Array:
         """Returns (b, n) root mean square errors of each marker under each of b poses, px."""
-        b, n = len(R), len(self.index)
-        errors = squared_errors(
-            R.repeat(n, axis=0),
-            p.repeat(n, axis=0),
-            np.tile(self.points, (b, 1, 1)),
-            np.tile(self.rays, (b, 1, 1)),
-            np.tile(self.by_ray, (b, 1, 1, 1)),
-        )
-        return np.sqrt(errors.reshape(b, n) / 4) * self.deviation
+        errors = squared_errors(R[:, None], p[:, None], self.points, self.rays, self.by_ray)
+        return np.sqrt(errors / 4) * self.deviation
 
     def agree(self, solution: PnpSolution, limit: float) -> NDArray[np.bool_]:
         """Returns (n,) which markers lie within `limit` (px) of where the best minimum has them."""
@@ -219,9 +212,11 @@ class MapLocalizer:
         large = (edges * edges).sum(axis=2).min(axis=1) >= self.parameters.min_side**2
         dropped["bad_corners"] += int((known & once & ~finite).sum())
         dropped["too_small"] += int((known & once & finite & ~large).sum())
-        seen = detections.select(known & once & finite & large)
-        largest_first = np.argsort(-_areas(seen.corners), kind="stable")
-        return seen.select(largest_first[:1] if self.parameters.use == "best" else largest_first)
+        seen = np.flatnonzero(known & once & finite & large)
+        largest_first = seen[np.argsort(-_areas(corners[seen]), kind="stable")]
+        return detections.select(
+            largest_first[:1] if self.parameters.use == "best" else largest_first
+        )
 
     def _candidates(self, R_CM: Array, p_CM: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
         """Returns `X_CW` by each marker's two poses: (2n, 3, 3) and (2n, 3)."""

@@ -21,6 +21,9 @@ Array = NDArray[np.float64]
 _DAMPING_START = 1e-6  # of the normal matrix' diagonal
 _DAMPING_END = 1e6  # no step of this length is an improvement: the minimum is reached
 _MIN_DEPTH = 1e-6  # m; a point nearer to the camera's plane has no image
+_IDENTITY = np.eye(3)
+_CROSS = np.zeros((3, 9))  # w to [w]x, row by row
+_CROSS[[0, 1, 2], [7, 2, 3]], _CROSS[[0, 1, 2], [5, 6, 1]] = 1.0, -1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,77 +48,71 @@ class PnpSolution:
 
 def rotation_from_vector(w: Array) -> Array:
     """Returns exp([w]x) of (..., 3) rotation vectors: (..., 3, 3) (Rodrigues)."""
-    angle = np.sqrt((w * w).sum(axis=-1))[..., None, None]
+    half_angle = np.sqrt((w * w).sum(axis=-1))[..., None, None] / 2
+    sinc = np.sinc(half_angle / np.pi)  # sin(h) / h, and 1 at h = 0
     W = cross_matrix(w)
-    small = angle < 1e-8
-    safe = np.where(small, 1.0, angle)
-    a = np.where(small, 1.0, np.sin(safe) / safe)
-    b = np.where(small, 0.5, (1 - np.cos(safe)) / (safe * safe))
-    return np.eye(3) + a * W + b * (W @ W)
+    return _IDENTITY + sinc * np.cos(half_angle) * W + sinc * sinc / 2 * (W @ W)
 
 
 def cross_matrix(w: Array) -> Array:
     """Returns [w]x of (..., 3) vectors: (..., 3, 3)."""
-    W = np.zeros((*w.shape[:-1], 3, 3))
-    W[..., 2, 1] = w[..., 0]
-    W[..., 0, 2] = w[..., 1]
-    W[..., 1, 0] = w[..., 2]
-    W[..., 1, 2] = -w[..., 0]
-    W[..., 2, 0] = -w[..., 1]
-    W[..., 0, 1] = -w[..., 2]
-    return W
+    return (w @ _CROSS).reshape(*w.shape, 3)
 
 
 def squared_errors(R: Array, p: Array, points: Array, rays: Array, by_ray: Array) -> Array:
-    """Returns the sum of squared residuals of each problem: (b,) px^2, inf behind the camera.
+    """Returns the sum of squared residuals of each problem: (...) px^2, inf behind the camera.
+
+    What stands for the problems, `...`, broadcasts.
 
     Args:
-        R: (b, 3, 3) `R_CF`.
-        p: (b, 3) `p_CF`, m.
-        points: (b, m, 3) or (m, 3), in F, m.
-        rays: (b, m, 2) or (m, 2), measured.
-        by_ray: (b, m, 2, 2) or (m, 2, 2) derivative of the pixels by the rays, px.
+        R: (..., 3, 3) `R_CF`.
+        p: (..., 3) `p_CF`, m.
+        points: (..., m, 3), in F, m.
+        rays: (..., m, 2), measured.
+        by_ray: (..., m, 2, 2) derivative of the pixels by the rays, px.
     """
-    p_C = points @ R.swapaxes(-1, -2) + p[:, None, :]
-    behind = (p_C[..., 2] < _MIN_DEPTH).any(axis=-1)
-    if behind.any():
-        p_C[behind] = (0.0, 0.0, 1.0)
+    p_C = points @ R.swapaxes(-1, -2) + p[..., None, :]
+    behind = _keep_before_camera(p_C)
     residual = by_ray @ (p_C[..., :2] / p_C[..., 2:] - rays)[..., None]
     error = (residual * residual).sum(axis=(-1, -2, -3))
     error[behind] = np.inf
     return error
 
 
-def _normal_equations(
-    R: Array, p: Array, points: Array, rays: Array, by_ray: Array
-) -> tuple[Array, Array, Array]:
-    """Returns the squared errors (b,), J'J (b, 6, 6) and J'r (b, 6) at the given poses."""
-    arm = points @ R.swapaxes(-1, -2)  # R p_F
-    p_C = arm + p[:, None, :]
-    behind = (p_C[..., 2] < _MIN_DEPTH).any(axis=-1)
+def _keep_before_camera(p_C: Array) -> NDArray[np.bool_]:
+    """Returns which problems (...) have one of their points (..., m, 3) behind the camera.
+
+    Their points are moved to where computing with them does no harm.
+    """
+    behind = np.asarray((p_C[..., 2] < _MIN_DEPTH).any(axis=-1))
     if behind.any():
         p_C[behind] = (0.0, 0.0, 1.0)
-    inverse_depth = 1 / p_C[..., 2]
-    ray = p_C[..., :2] * inverse_depth[..., None]
+    return behind
+
+
+def _normal_equations(R: Array, p: Array, points: Array, rays: Array, by_ray: Array) -> Array:
+    """Returns [J r]'[J r], (b, 7, 7), at the given poses: J'J, J'r and the squared error r'r.
+
+    Of a problem with a point behind the camera the error is infinite.
+    """
+    arm = points @ R.swapaxes(-1, -2)  # R p_F
+    p_C = arm + p[:, None, :]
+    behind = _keep_before_camera(p_C)
+    depth = p_C[..., 2:]
+    ray = p_C[..., :2] / depth
     # Derivative of the ray (x/z, y/z) by position and, through p_C = w x arm + ..., by rotation.
-    D = np.zeros((*ray.shape, 6))
-    D[..., 0, 3] = D[..., 1, 4] = inverse_depth
-    D[..., 5] = -ray * inverse_depth[..., None]
-    gz = D[..., 5]
-    ax, ay, az = arm[..., 0], arm[..., 1], arm[..., 2]
-    D[..., 0] = ay[..., None] * gz
-    D[..., 1] = -ax[..., None] * gz
-    D[..., 1, 0] -= az * inverse_depth
-    D[..., 0, 1] += az * inverse_depth
-    D[..., 0, 2] = -ay * inverse_depth
-    D[..., 1, 2] = ax * inverse_depth
-    rows = 2 * points.shape[-2]
-    J = (by_ray @ D).reshape(len(R), rows, 6)
-    r = (by_ray @ (ray - rays)[..., None]).reshape(len(R), rows, 1)
-    Jt = J.swapaxes(-1, -2)
-    error = (r * r).sum(axis=(-1, -2))
-    error[behind] = np.inf
-    return error, Jt @ J, (Jt @ r)[..., 0]
+    by_position = np.empty((*ray.shape, 3))
+    by_position[..., :2] = by_ray
+    by_position[..., 2:] = by_ray @ -ray[..., None]
+    by_position /= depth[..., None]
+    rows = np.empty((*ray.shape, 7))
+    rows[..., :3] = by_position @ cross_matrix(-arm)
+    rows[..., 3:6] = by_position
+    rows[..., 6:] = by_ray @ (ray - rays)[..., None]
+    rows = rows.reshape(len(R), 2 * points.shape[-2], 7)
+    product = np.asarray(rows.swapaxes(-1, -2) @ rows)
+    product[behind, 6, 6] = np.inf
+    return product
 
 
 def refine(
@@ -148,26 +145,27 @@ def refine(
         The local minima. A problem whose start has a point behind the camera keeps its start and
         an infinite error.
     """
-    error, H, g = _normal_equations(R, p, points, rays, by_ray)
     R, p = R.copy(), p.copy()
+    product = _normal_equations(R, p, points, rays, by_ray)
+    H, g, error = product[:, :6, :6], product[:, :6, 6:], product[:, 6, 6]  # views
     damping = np.full(len(R), _DAMPING_START)
     active = np.isfinite(error)
-    diagonal = np.arange(6)
+    identity = np.eye(6)
     for _ in range(iterations):
-        damped = H.copy()
-        damped[:, diagonal, diagonal] *= 1 + damping[:, None]
+        damped = H * (1 + damping[:, None, None] * identity)
         if not active.all():
-            damped[~active] = np.eye(6)
-        step = np.asarray(-np.linalg.solve(damped, g[..., None])[..., 0], np.float64)
+            damped[~active] = identity
+        step = np.asarray(np.linalg.solve(damped, -g), np.float64)
         # What the step would gain is known beforehand: the last look is spared.
-        active &= -(step * g).sum(axis=1) >= tolerance * (1 + error)
+        active &= -(step * g).sum(axis=(1, 2)) >= tolerance * (1 + error)
         if not active.any():
             break
+        step = step[..., 0]
         R_new = rotation_from_vector(step[:, :3]) @ R
         p_new = p + step[:, 3:]
-        error_new, H_new, g_new = _normal_equations(R_new, p_new, points, rays, by_ray)
-        better = active & (error_new <= error)
-        for old, new in ((R, R_new), (p, p_new), (error, error_new), (H, H_new), (g, g_new)):
+        product_new = _normal_equations(R_new, p_new, points, rays, by_ray)
+        better = active & (product_new[:, 6, 6] <= error)
+        for old, new in ((R, R_new), (p, p_new), (product, product_new)):
             old[better] = new[better]
         damping *= np.where(better, 0.1, 10.0)
         active &= damping < _DAMPING_END

@@ -11,7 +11,6 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
-from systems.markers.pnp import cross_matrix
 from systems.noise import NoiseStream, sample_index
 from systems.validation import require, require_non_negative, require_positive
 
@@ -194,7 +193,7 @@ def digital(sample: Array, limit: Array, bits: int) -> Array:
         return np.clip(sample, -limit, limit)
     half = 2.0 ** (bits - 1)
     step = limit / half
-    return np.clip(np.rint(sample / step), -half, half - 1) * step
+    return np.minimum(np.maximum(np.rint(sample / step), -half), half - 1) * step
 
 
 def ideal_sample(X_WB: RigidTransform, V_WB: Array, A_WB: Array, p_BS: Array) -> Array:
@@ -210,12 +209,18 @@ def ideal_sample(X_WB: RigidTransform, V_WB: Array, A_WB: Array, p_BS: Array) ->
         (6,) angular velocity (rad/s) and specific force (m/s^2), in B; at rest the force is +g
         upward.
     """
-    R_WB = X_WB.rotation().matrix()
-    W = cross_matrix(V_WB[:3])
-    arm = R_WB @ p_BS
-    acceleration = A_WB[3:] + (cross_matrix(A_WB[:3]) + W @ W) @ arm
-    acceleration[2] += GRAVITY
-    return (np.stack([V_WB[:3], acceleration]) @ R_WB).ravel()
+    in_W = np.array([V_WB[:3], A_WB[:3], A_WB[3:]])
+    in_W[2, 2] += GRAVITY
+    rate, turn, (fx, fy, fz) = (in_W @ X_WB.rotation().matrix()).tolist()
+    (wx, wy, wz), (ax, ay, az), (px, py, pz) = rate, turn, p_BS.tolist()
+    # f + a x p + w x (w x p)
+    along, square = wx * px + wy * py + wz * pz, wx * wx + wy * wy + wz * wz
+    force = (
+        fx + ay * pz - az * py + wx * along - px * square,
+        fy + az * px - ax * pz + wy * along - py * square,
+        fz + ax * py - ay * px + wz * along - pz * square,
+    )
+    return np.array([*rate, *force])
 
 
 class Imu(LeafSystem):

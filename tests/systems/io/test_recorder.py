@@ -155,6 +155,30 @@ def test_poses_take_the_time_of_the_context(tmp_path):
     assert first[2].transforms[0].child_frame_id == "base_link"
 
 
+class Riser(LeafSystem):
+    """Sends the pose of something that rises by 1 m/s."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareAbstractOutputPort(
+            "pose",
+            lambda: AbstractValue.Make(RigidTransform()),
+            lambda c, o: o.set_value(RigidTransform([0.0, 0.0, c.get_time()])),
+        )
+
+
+def test_a_pose_is_recorded_as_it_was_though_it_moves_on(tmp_path):
+    builder = DiagramBuilder()
+    riser = builder.AddSystem(Riser())
+    channel = Channel("pose", "/truth", POSE, RigidTransform(), rate=4.0)
+    recorder = builder.AddSystem(Recorder(channels=[channel], writer=BagWriter(tmp_path / "bag")))
+    builder.Connect(riser.get_output_port(), recorder.GetInputPort("pose"))
+    Simulator(builder.Build()).AdvanceTo(1.5)
+    recorder.close()
+    heights = [(t, m.pose.position.z) for _, t, m in BagReader(tmp_path / "bag").messages()]
+    assert heights == [(k / 4, k / 4) for k in range(6)]
+
+
 def test_static_messages_come_first_and_once(tmp_path):
     camera = PinholeCamera.from_focal_length(64, 48, 50.0)
     static = {
