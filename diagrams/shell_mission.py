@@ -62,6 +62,8 @@ class ShellMission(Mission):
             )
         self._add_chain()
         if meshcat is not None:
+            eye, target = scenario.world.view()
+            meshcat.SetCameraPose(len(self.robots) * eye, target)  # a team is as much larger
             for robot in self.robots:
                 robot.show(meshcat)
         self.recorder = wiring.add_recorder(out)
