@@ -32,6 +32,7 @@ from diagrams.world import World
 from plants.lighting import daylight
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.layout import MarkerMap
+from systems.markers.projector import PlacedMarker
 from systems.sensors.faults import Fault, FaultInjector
 from systems.validation import nearest, require
 
@@ -183,6 +184,7 @@ class StationBuilder:
         mountings: optical frame to (robot, `X_BC`), for /tf_static.
         end_time: time of the last message that is played, s.
         outputs: exported so far, by name.
+        carried_markers: on robots, by the robot's name.
         shells: that robots stand on, by the name of who has it.
         pulls: what the magnets of each robot on a shell do: lists of forces for the plant.
         robots: by name.
@@ -203,6 +205,7 @@ class StationBuilder:
     mountings: dict[str, tuple[str, RigidTransform]] = field(default_factory=dict)
     end_time: float = 0.0
     outputs: dict[str, OutputPort] = field(default_factory=dict)
+    carried_markers: dict[str, list[PlacedMarker]] = field(default_factory=dict)
     shells: dict[str, Shell] = field(default_factory=dict)
     pulls: list[OutputPort] = field(default_factory=list)
     robots: dict[str, Robot] = field(default_factory=dict)

@@ -23,7 +23,7 @@ from diagrams.study_report import by_variant, metric_values, short_keys, wilson_
 _PANELS = 16  # the success rate and as many metrics as leave the figure legible
 _COLUMNS = 4
 _LABEL_LENGTH = 30  # of a variant's value
-_UNITS = {"m": "m", "s": "s", "deg": "degrees"}  # by the last word of a metric's name
+_UNITS = {"m": "m", "s": "s", "ms": "ms", "deg": "degrees"}  # by the last word of a metric's name
 _UNITS_BY_NAME = {"integrated_jerk": "m²/s⁵"}
 _NOT_SHOWN = ("sim_seconds",)  # the time to the goal, when it is reached, says it
 

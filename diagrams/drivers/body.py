@@ -20,6 +20,7 @@ from plants.differential_drive import (
     servo_matrix,
     wheel_speeds,
 )
+from plants.marker_ring import SIDES, MarkerRing, add_marker_ring
 from systems.angles import spatial_pose
 
 
@@ -29,9 +30,12 @@ class DifferentialDriveBody:
 
     Attributes:
         parameters: dimensions and masses.
+        ring: markers on its four sides, for other robots to see: the first robot with such a ring
+            bears the ids 0 to 3 (front, left, back, right), the next 4 to 7, and so on.
     """
 
     parameters: DifferentialDriveParameters = field(default_factory=DifferentialDriveParameters)
+    ring: MarkerRing | None = None
 
     @property
     def hull_radius(self) -> float:
@@ -57,6 +61,14 @@ class DifferentialDriveBody:
         robot.model = add_differential_drive(plant, self.parameters, robot.name, motor)
         body = plant.GetBodyByName("base_link", robot.model)
         plant.SetDefaultFloatingBaseBodyPose(body, spatial_pose(robot.start))
+        if self.ring is not None:
+            station.carried_markers[robot.name] = add_marker_ring(
+                plant,
+                body,
+                self.ring,
+                family=station.marker_map.family,
+                first_id=len(SIDES) * len(station.carried_markers),
+            )
 
     def add_state(self, station: StationBuilder, robot: Robot) -> None:
         """Adds what says where the robot is and takes its wheel speeds; exports the truth."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -270,10 +271,11 @@ class Camera(CameraDriver):
         return self.mounting()
 
     def view(self, station: StationBuilder, robot: Robot) -> View:
-        """Returns the boards of the world."""
+        """Returns the boards of the world and those on other robots."""
         world = station.scene_graph.world_frame_id()
+        others = [m for name, m in station.carried_markers.items() if name != robot.name]
         return View(
             X_BC=self.mounting(),
-            markers=placed_markers(station.true_markers, world),
+            markers=[*placed_markers(station.true_markers, world), *chain(*others)],
             own_frames=[robot.frame_id],
         )

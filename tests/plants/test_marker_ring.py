@@ -1,0 +1,75 @@
+"""Markers on the four sides of a robot, and what other robots' cameras make of them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from pydrake.systems.analysis import Simulator
+
+from diagrams.schema import Place, convert
+from diagrams.station import RobotParameters, Station
+from diagrams.world import TagList, WorldParameters
+from plants.marker_ring import MarkerRing
+
+FOCAL, CENTRE = 500.0, 322.4  # px, of vga.yaml, which is slightly distorted
+
+
+def test_each_marker_faces_away_from_the_robot() -> None:
+    ring = MarkerRing(size=0.1, distance=0.2, height=0.3)
+    for k, X_BM in enumerate(ring.poses()):
+        outward = [math.cos(k * math.pi / 2), math.sin(k * math.pi / 2), 0.0]
+        np.testing.assert_allclose(X_BM.rotation().matrix()[:, 0], outward, atol=1e-12)
+        np.testing.assert_allclose(X_BM.rotation().matrix()[:, 2], [0, 0, 1], atol=1e-12)
+        np.testing.assert_allclose(
+            X_BM.translation(), np.array([*(0.2 * np.array(outward[:2])), 0.3])
+        )
+
+
+def test_a_size_of_zero_is_refused() -> None:
+    with pytest.raises(ValueError, match="size is 0"):
+        MarkerRing(size=0.0)
+
+
+def robot(x: float, y: float, heading: float) -> RobotParameters:
+    camera = {"type": "camera", "calibration": "vga.yaml", "position": [0.0, 0.0, 0.4]}
+    plain = {
+        "body": {"type": "differential_drive", "ring": {}},
+        "drive": "wheel_servo",
+        "start": {"x": x, "y": y, "heading_deg": heading},
+        "sensors": {"camera": camera},
+    }
+    parameters: RobotParameters = convert(plain, RobotParameters, Place())
+    return parameters
+
+
+@pytest.fixture(scope="module", params=["projected", "rendered"])
+def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """What three robots see of each other: b and c stand before a, c turned by 90 degrees."""
+    station = Station(
+        world=WorldParameters(markers=TagList("36h11", 0.16, [])),
+        robots={"a": robot(0, 0, 0), "b": robot(2, 0, 180), "c": robot(2, 1.0, 90)},
+        sight=request.param,
+        time_step=0.01,
+    )
+    simulator = Simulator(station)
+    context = simulator.get_mutable_context()
+    for name in "abc":
+        station.GetInputPort(f"{name}.drive.command").FixValue(context, [0.0, 0.0])
+    simulator.AdvanceTo(0.2)
+    return {n: station.GetOutputPort(f"{n}.camera.detections").Eval(context) for n in "abc"}
+
+
+def test_robots_see_the_others_markers_by_their_ids(seen: dict[str, Any]) -> None:
+    # b (ids 4 to 7) faces a; of c (8 to 11), which heads to the left, a sees left side and back.
+    assert set(seen["a"].ids) == {4, 9, 10}
+    assert set(seen["b"].ids) == {0}
+    assert set(seen["c"].ids) == set()
+
+
+def test_they_are_where_they_should_be(seen: dict[str, Any]) -> None:
+    where = {int(i): c.mean(axis=0) for i, c in zip(seen["a"].ids, seen["a"].corners, strict=True)}
+    assert where[4][0] == pytest.approx(CENTRE, abs=1.5)
+    assert where[9][0] == pytest.approx(CENTRE - FOCAL * 1.0 / 1.85, abs=8)
