@@ -73,6 +73,8 @@ class NavigationScenario(Scenario):
         camera: which of the sensors looks for markers.
         imu: which of the sensors measures the yaw rate.
         lidar: which of the sensors scans for obstacles; none without one.
+        encoders: which of the sensors counts the wheels' turns, for an estimator with the port
+            `wheel_speeds`; none without one: the robot knows its commands only.
         localizer: what is trusted of a picture.
         estimator: a block with the ports command, imu, marker_pose, marker_alternative, pose,
             covariance; nis if it has any.
@@ -94,6 +96,7 @@ class NavigationScenario(Scenario):
     camera: str = "front_camera"
     imu: str = "imu"
     lidar: str | None = None
+    encoders: str | None = None
     localizer: LocalizerParameters = field(default_factory=LocalizerParameters)
     estimator: Annotated[Choice, ESTIMATORS]
     controller: Annotated[Choice, CONTROLLERS]
@@ -123,7 +126,12 @@ class NavigationScenario(Scenario):
                     None,
                     f"one of the sensors, or {key}: none",
                 )
-        for key, method in (("camera", "model"), ("imu", "add"), ("lidar", "planar_mounting")):
+        for key, method in (
+            ("camera", "model"),
+            ("imu", "add"),
+            ("lidar", "planar_mounting"),
+            ("encoders", "speeds"),
+        ):
             name = getattr(self, key)
             if name is None:
                 continue
@@ -191,6 +199,8 @@ class NavigationMission(Mission):
         )
         wiring.add(scenario.controller.build(waypoints=waypoints), "controller")
         wiring.add(SearchWhenLost(parameters=scenario.search), "search")
+        if scenario.encoders is not None:
+            wiring.add(scenario.robot.sensors[scenario.encoders].build().speeds(), "wheel_speeds")
 
     def _log_and_record(self, wiring: Wiring) -> None:
         together = wiring.add(Multiplexer([3, 9]), "estimate")
@@ -290,6 +300,9 @@ def _connect(wiring: Wiring, scenario: NavigationScenario) -> None:
     # An estimator or a controller may do without some of what there is.
     wiring.connect_if_wanted(f"{ROBOT}.drive.sent", "estimator.command")
     wiring.connect_if_wanted(f"{ROBOT}.{scenario.imu}.sample", "estimator.imu")
+    if scenario.encoders is not None:
+        wiring.connect(f"{ROBOT}.{scenario.encoders}.ticks", "wheel_speeds.ticks")
+        wiring.connect_if_wanted("wheel_speeds.wheel_speeds", "estimator.wheel_speeds")
     wiring.connect_if_wanted("localizer.pose", "estimator.marker_pose")
     wiring.connect_if_wanted("localizer.alternative", "estimator.marker_alternative")
     wiring.connect("estimator.pose", "sequencer.pose")

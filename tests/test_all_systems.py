@@ -84,6 +84,7 @@ from systems.estimators.pose_chain import PoseChain
 from systems.estimators.reference_motion import CarriedShellMotion, KnownShellMotion
 from systems.estimators.shell_ekf import ShellEkf
 from systems.estimators.shell_rule import ShellRule
+from systems.estimators.wheel_speeds import WheelSpeeds
 from systems.flow.lucas_kanade import PointTracker
 from systems.flow.mean_flow import MeanFlow
 from systems.flow.projector import FlowProjector
@@ -636,6 +637,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
         WheelDrive(to_wheel_speeds=lambda c: wheel_speeds(c, DifferentialDriveParameters())),
         {"command": vector(0.3, 0.2)},
     ),
+    WheelSpeeds: lambda _: Case(WheelSpeeds(ticks_per_turn=80.0), {"ticks": vector(100.0, 120.0)}),
     WheelEncoders: lambda _: Case(WheelEncoders(), {"wheel_angles": vector(7.0, -3.0)}),
     WheelPwm: lambda _: Case(
         WheelPwm(to_duty=MotorModel(MotorParameters()).duty), {"wheel_speeds": vector(3.0, 2.0)}
