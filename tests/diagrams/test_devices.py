@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
 
+from diagrams.run import simulate
 from diagrams.scenario import load_scenario
+from diagrams.schema import ScenarioError
 from diagrams.station import Station
 from plants.motors import MotorModel, MotorParameters
 from systems.controllers.wheel_pwm import pulse_widths
@@ -183,3 +185,31 @@ def test_played_back_their_signals_are_the_same(
         after = [(r.log_time, r.data) for r in BagReader(tmp_path / "bag").records([topic])]
         assert len(after) > 290
         assert after == before[: len(after)]
+
+
+def test_a_filter_that_hears_the_encoders_knows_that_the_motors_are_weak() -> None:
+    """Both wheels at 80 % of their speed, and no marker from the third second on."""
+    weak = {
+        "sight": "projected",
+        "duration": 12.0,
+        "estimator": "ekf",
+        "robot.drive": {"type": "dc_motors", "motors": {"right_gain": 0.8, "left_gain": 0.8}},
+        "robot.faults": [{"signal": "front_camera.detections", "kind": "silent", "start": 3.0}],
+    }
+    encoders = {
+        "robot.sensors.encoders": {"type": "wheel_encoders", "ticks_per_turn": 960},
+        "encoders": "encoders",
+    }
+    errors = []
+    for settings in (weak, weak | encoders):
+        run = simulate(load_scenario("navigation_open", settings))
+        log = run.mission.pose_log(run.context)  # type: ignore[attr-defined]
+        errors.append(float(np.linalg.norm(log.errors()[-1, :2])))
+    without, with_them = errors
+    assert with_them < 0.08
+    assert without > 5 * with_them
+
+
+def test_encoders_that_are_not_there_are_refused() -> None:
+    with pytest.raises(ScenarioError, match=r"encoders is 'wheels': must be one of the robot's"):
+        load_scenario("navigation_open", {"encoders": "wheels"})
