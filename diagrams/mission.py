@@ -139,9 +139,9 @@ class Wiring:
         if port in _port_names(self._blocks[block], "Input"):
             self.connect(source, target)
 
-    def log(self, name: str) -> None:
-        """Logs a vector output at `LOG_RATE`."""
-        self._logs[name] = LogVectorOutput(self.output(name), self.builder, 1 / LOG_RATE)
+    def log(self, name: str, rate: float = LOG_RATE) -> None:
+        """Logs a vector output at `rate` (Hz)."""
+        self._logs[name] = LogVectorOutput(self.output(name), self.builder, 1 / rate)
         self._logs[name].set_name(f"log of {name}")
 
     def record(self, source: str, signal: Signal) -> None:

@@ -138,7 +138,10 @@ class NavigationScenario(Scenario):
             fit = [n for n, s in self.robot.sensors.items() if hasattr(s.target, method)]
             have = ", ".join(fit) or "none"
             require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
-        room = self.robot.body.build().hull_radius
+        body = self.robot.body
+        fits = hasattr(body.target, "hull_radius")
+        require(fits, "robot.body", body.type, "one that drives on the ground")
+        room = body.build().hull_radius
         for k, point in enumerate(self.waypoints):
             check_free(self.world.arena, point, room, f"waypoints[{k}]")
         start = self.robot.start

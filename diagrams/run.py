@@ -20,16 +20,24 @@ from diagrams.mission import FRAME_RATE, Mission
 from diagrams.scenario import Scenario, save_scenario
 from systems.validation import require_non_negative
 
+# Of a run; a team's other robots have theirs with their names.
 RESULTS = (
     "report.json",
     "summary.png",
+    "summary_robot_*.png",
     "replay.html",
     "scenario.yaml",
     "estimate.tum",
+    "estimate_robot_*.tum",
     "truth.tum",
+    "truth_robot_*.tum",
+    "table1.json",
+    "table1.png",
+    "table1_robot_*.json",
+    "table1_robot_*.png",
+    "calibration.json",
 )
 
-_GARBAGE = 50_000  # objects between two looks for unreachable cycles
 _MAX_STEP = 0.01  # s, of the integrator; only kinematic twins have continuous state
 
 
@@ -77,18 +85,14 @@ def simulate(
         meshcat.StartRecording(frames_per_second=FRAME_RATE)
     mission: Mission = scenario.build(meshcat=meshcat, out=out)
     if out is not None:  # from here on the folder is this run's
-        for name in RESULTS:
-            (out / name).unlink(missing_ok=True)
+        for pattern in RESULTS:
+            for path in out.glob(pattern):
+                path.unlink()
         save_scenario(scenario, out / "scenario.yaml")
-    # Diagram and modules stay: to look through them again and again costs 5 %. What a run makes is
-    # gone when nobody holds it: to look for cycles every 700 objects costs as much again.
-    gc.freeze()
-    often = gc.get_threshold()
-    gc.set_threshold(_GARBAGE, *often[1:])
+    gc.freeze()  # diagram and modules stay: to look through them again and again costs 5 %
     try:
         outcome, context, wall = _advance(scenario, mission, realtime, progress)
     finally:
-        gc.set_threshold(*often)
         gc.unfreeze()
         if mission.recorder is not None:
             mission.recorder.close()

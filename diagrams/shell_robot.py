@@ -10,7 +10,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
 from diagrams.channels import shell_estimate_signal
-from diagrams.mission import FRAME_RATE, Wiring
+from diagrams.mission import FRAME_RATE, LOG_RATE, Wiring
 from diagrams.shell_viewer import ShellViewer
 from diagrams.shell_world import REFERENCE
 from plants.relative_pose import RelativePose
@@ -26,6 +26,8 @@ from systems.shell.markers_seen import MarkersSeen
 
 if TYPE_CHECKING:
     from diagrams.snailbot import SnailBotScenario
+
+_MARGIN_RATE = 10.0  # Hz: it changes with the place, by a millimetre or so in between
 
 
 class ShellRobot:
@@ -143,9 +145,8 @@ class ShellRobot:
         scenario = self._scenario
         parameters = self.body.body.parameters
         imu = scenario.robot.sensors[scenario.imu].build()
-        choice = scenario.told_estimator()
         self.estimator = self._add(
-            choice.build(
+            scenario.estimator.build(
                 view=self._view,
                 marker_map=self._wiring.station.marker_map,
                 radius=scenario.world.shell.radius,
@@ -241,9 +242,9 @@ class ShellRobot:
             block, _, name = port.partition(".")
             if wiring.has_output(f"{self.block(block)}.{name}"):
                 wiring.log(f"{self.block(block)}.{name}")
-        for port in ("pose", "margin"):
+        for port, rate in (("pose", LOG_RATE), ("margin", _MARGIN_RATE)):
             if wiring.has_output(f"truth.{self.name}.{port}"):
-                wiring.log(f"truth.{self.name}.{port}")
+                wiring.log(f"truth.{self.name}.{port}", rate)
         signal = shell_estimate_signal(self.name, rate=50.0)
         wiring.record(f"{self.block('estimate')}.y0", signal)
 

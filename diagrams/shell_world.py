@@ -76,13 +76,16 @@ class ShellWorldParameters(World):
 
     def __post_init__(self) -> None:
         require_non_negative(placement_tolerance_deg=self.placement_tolerance_deg)
-        where = "the paper's markers" if self.markers is None else f"marker map {self.markers}"
+        # What is no map names its file itself.
+        where = "the paper's markers: " if self.markers is None else ""
         try:
-            check_on_shell(self.marker_map(), self.shell.radius)
+            markers = self.marker_map()
+            where = f"marker map {self.markers}: "
+            check_on_shell(markers, self.shell.radius)
         except ScenarioError:
             raise
         except ValueError as error:
-            raise ValueError(f"{where}: {error}") from error
+            raise ValueError(f"{where}{error}") from error
 
     def resources(self) -> dict[str, Any]:
         """Returns the shell, which a body is made for."""

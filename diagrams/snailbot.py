@@ -20,7 +20,7 @@ from diagrams.schema import ScenarioError
 from diagrams.shell_errors import PRESETS, ShellErrors, told
 from diagrams.shell_mission import ShellMission
 from diagrams.shell_world import REFERENCE, ShellWorldParameters
-from diagrams.station import RobotParameters
+from diagrams.station import Hardware, RobotParameters
 from diagrams.tables import Choice, Table
 from systems.controllers.shell_route import Leg, ShellRouteParameters, routine
 from systems.estimators.madgwick import MadgwickParameters
@@ -101,7 +101,7 @@ class SnailBotScenario(Scenario):
     Attributes:
         world: the reference robot.
         robot: what all robots of the team are like; needs a `shell_camera` and an IMU among its
-            sensors. Its `start` is that of the first robot.
+            sensors.
         team: the robots; the first is called `robot`, the others `robot_2`, `robot_3`, ... Those
             that carry another have no springs: they do not rock.
         iterations: how often each drives its route. The run's `duration` is for one.
@@ -123,7 +123,7 @@ class SnailBotScenario(Scenario):
     """
 
     world: ShellWorldParameters = field(default_factory=ShellWorldParameters)
-    robot: RobotParameters
+    robot: Hardware
     team: list[Member] = field(default_factory=lambda: [Member()])
     iterations: int = 1
     errors: Literal["none", "base", "harsh"] | ShellErrors | None = None
@@ -147,6 +147,8 @@ class SnailBotScenario(Scenario):
         require(
             force is None or 0 <= force < math.inf, "magnet_force", force, "0 or greater, finite"
         )
+        body = self.robot.body
+        require(_has(body.target, "carries_shell"), "robot.body", body.type, "one that climbs")
         for key, method in (("camera", "planned_view"), ("imu", "position")):
             name = getattr(self, key)
             fit = [n for n, s in self.robot.sensors.items() if _has(s.target, method)]
@@ -159,6 +161,8 @@ class SnailBotScenario(Scenario):
             imu.rate,
             f"at least the camera's, {camera.rate:g} Hz",
         )
+        # The resolved scenario says what the filter was told: it is saved, and loaded as given.
+        self.estimator = self.told_estimator()
 
     @property
     def time_limit(self) -> float:
@@ -184,13 +188,11 @@ class SnailBotScenario(Scenario):
             start = member.start
             if k > 0 and start.on == REFERENCE:
                 start = replace(start, on=names[k - 1])
-            robots[name] = replace(
-                self._hardware(carries_shell=k + 1 < len(self.team)),
-                start=start,  # type: ignore[arg-type]
-            )
+            hardware = self._hardware(carries_shell=k + 1 < len(self.team))
+            robots[name] = RobotParameters(**vars(hardware), start=start)  # type: ignore[arg-type]
         return robots
 
-    def _hardware(self, *, carries_shell: bool) -> RobotParameters:
+    def _hardware(self, *, carries_shell: bool) -> Hardware:
         """Returns what a robot is made of, with errors and magnets as the scenario wants them."""
         errors, body = self.bounds(), self.robot.body
         changes: dict[str, Any] = {}
@@ -234,8 +236,12 @@ class SnailBotScenario(Scenario):
         parameters = choice.arguments.get("parameters")
         if errors is None or not isinstance(parameters, ShellEkfParameters):
             return choice
-        given = [key[len(choice.place.key) :] for key in choice.place.origins]
-        wider = {k: v for k, v in told(parameters, errors).items() if (k,) not in given}
+        place = choice.place
+        wider = {
+            name: deviation
+            for name, deviation in told(parameters, errors).items()
+            if (*place.key, name) not in place.origins
+        }
         return _changed(choice, parameters=replace(parameters, **wider))
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:

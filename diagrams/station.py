@@ -100,13 +100,12 @@ class Start:
         return np.array([self.x, self.y, math.radians(self.heading_deg)])
 
 
-@dataclass
-class RobotParameters:
-    """One robot: its body, where it starts, how it is driven, what it senses with.
+@dataclass(kw_only=True)
+class Hardware:
+    """What a robot is made of: its body, how it is driven, what it senses with.
 
     Attributes:
         body: model.
-        start: pose at the start.
         drive: driver of the wheels.
         sensors: drivers by device name.
         faults: what goes wrong with the sensors on purpose.
@@ -114,7 +113,6 @@ class RobotParameters:
 
     body: Annotated[Choice, BODIES]
     drive: Annotated[Choice, DRIVES]
-    start: Start = field(default_factory=Start)
     sensors: dict[str, Annotated[Choice, SENSORS]] = field(default_factory=dict)
     faults: list[Fault] = field(default_factory=list)
 
@@ -126,6 +124,17 @@ class RobotParameters:
                 name,
                 f"a name in lower case, as ROS takes them, other than {', '.join(_TAKEN)}",
             )
+
+
+@dataclass(kw_only=True)
+class RobotParameters(Hardware):
+    """One robot, and where it starts.
+
+    Attributes:
+        start: pose at the start; of other worlds than an arena, what has a `pose()` there.
+    """
+
+    start: Start = field(default_factory=Start)
 
 
 @dataclass

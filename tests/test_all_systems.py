@@ -399,7 +399,11 @@ CASES: dict[type, Callable[[Path], Case]] = {
             family=TAG,
             effects=ImageEffects(exposure_samples=2, read_noise=1.0),
         ),
-        {"query_object": QUERIES, "spatial_velocity": vector(0, 0, 1, 0, 0, 0)},
+        {
+            "query_object": QUERIES,
+            "spatial_velocity": vector(0, 0, 1, 0, 0, 0),
+            "active": vector(1.0),
+        },
     ),
     DwaAvoider: lambda _: avoider(DwaAvoider),
     EstimateViewer: viewer,
@@ -430,7 +434,10 @@ CASES: dict[type, Callable[[Path], Case]] = {
             parameters=LidarParameters(rate=10.0, dropout_probability=0.0),
             role=Role.kPerception,  # of the markers' boards
         ),
-        {"query_object": QUERIES, "spatial_velocity": vector(0, 0, 1, 0, 0, 0)},
+        {
+            "query_object": QUERIES,
+            "spatial_velocity": vector(0, 0, 1, 0, 0, 0),
+        },
     ),
     Localizer: lambda _: Case(
         Localizer(
@@ -454,7 +461,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
             markers=placed_markers(MAP, WORLD),
             family=TAG,
         ),
-        {"query_object": QUERIES},
+        {"query_object": QUERIES, "active": vector(1.0)},
     ),
     MessagePlayback: lambda _: Case(
         MessagePlayback(
@@ -567,7 +574,11 @@ CASES: dict[type, Callable[[Path], Case]] = {
             rate=15.0,
             effects=ImageEffects(exposure_samples=2, read_noise=1.0),
         ),
-        {"query_object": QUERIES, "spatial_velocity": vector(0, 0, 1, 0, 0, 0)},
+        {
+            "query_object": QUERIES,
+            "spatial_velocity": vector(0, 0, 1, 0, 0, 0),
+            "active": vector(1.0),
+        },
     ),
     SearchWhenLost: lambda _: Case(
         SearchWhenLost(),

@@ -62,7 +62,9 @@ class CameraDriver(ABC):
     """What all cameras on robots have; where one is mounted, and what it sees, its own class says.
 
     Ports of the station: `{robot}.{device}.image` (CameraImage; of size 0 when there are none, as
-    under projected sight), `{robot}.{device}.detections` (Detections), `{robot}.{device}.health`.
+    under projected sight), `{robot}.{device}.detections` (Detections), `{robot}.{device}.health`;
+    an input, of a simulated camera, `{robot}.{device}.active` (vector of 1): while it is 0 no
+    pictures are taken; it may be left unconnected.
 
     Attributes:
         calibration: camera file (bundled, or beside the scenario).
@@ -213,6 +215,7 @@ class CameraDriver(ABC):
             station.connect(
                 station.scene_graph.get_query_output_port(), projector.query_object_input_port()
             )
+            station.export_input(projector.active_input_port(), f"{name}.active")
             return None, projector.detections_output_port()
         shared |= {"effects": self.effects, "clipping": view.clipping}
         sensor: DrawnCamera | RenderedCamera
@@ -237,6 +240,7 @@ class CameraDriver(ABC):
         station.connect(
             robot.state.GetOutputPort("spatial_velocity"), sensor.spatial_velocity_input_port()
         )
+        station.export_input(sensor.active_input_port(), f"{name}.active")
         return sensor.image_output_port(), None
 
 

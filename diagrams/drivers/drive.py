@@ -11,6 +11,7 @@ from diagrams.station import Robot, StationBuilder
 from plants.motors import DcMotors, MotorModel, MotorParameters
 from systems.controllers.wheel_drive import WheelDrive, WheelDriveParameters
 from systems.controllers.wheel_pwm import WheelPwm
+from systems.validation import require
 
 
 @dataclass
@@ -67,6 +68,12 @@ class DcMotorDrive:
         station.connect(drive.wheel_speeds_output_port(), pwm.wheel_speeds_input_port())
         station.connect(pwm.pwm_output_port(), motors.pwm_input_port())
         if station.dynamics == "multibody":
+            require(
+                robot.wheel_rates is not None,
+                f"{robot.name}.drive",
+                "dc_motors",
+                "wheel_servo: of this body nothing tells how the wheels turn",
+            )
             station.connect(robot.wheel_rates, motors.wheel_speeds_input_port())
             station.connect(motors.servo_speeds_output_port(), robot.wheel_speeds)
         else:

@@ -249,6 +249,7 @@ class MarkerProjector(SampledSensor):
         name: MarkerProjector
         input_ports:
         - query_object
+        - active
         output_ports:
         - detections
 
@@ -272,6 +273,7 @@ class MarkerProjector(SampledSensor):
 
     Ports:
         query_object (input, QueryObject): SceneGraph's `query`.
+        active (input, vector of 1): while it is 0 nothing is looked for; may be left unconnected.
         detections (output, Detections): what was found in the picture, sampled at `rate`, sent
             `latency` later; the stamp is the picture's time. `hamming` is 0. `decision_margin` is
             NaN: contrast is not simulated. Before the first arrival the stamp is NaN.
@@ -329,6 +331,7 @@ class MarkerProjector(SampledSensor):
             latency=latency,
             nothing=Detections(frame_id=frame_id, family=family.name),
             clock_error=clock_error,
+            switchable=True,
         )
 
     def query_object_input_port(self) -> InputPort:

@@ -25,7 +25,7 @@ Image = NDArray[np.uint8]
 class MountedCamera(SampledSensor):
     """Base of the cameras fixed to a body: a subclass implements `_picture`.
 
-    It has the inputs `query_object` and `spatial_velocity` and the output `image`.
+    It has the inputs `query_object`, `spatial_velocity` and `active` and the output `image`.
 
     Args:
         parent_frame: geometry frame of the body that carries the camera.
@@ -77,6 +77,7 @@ class MountedCamera(SampledSensor):
             latency=latency,
             nothing=CameraImage(frame_id=frame_id),
             clock_error=clock_error,
+            switchable=True,
         )
 
     def query_object_input_port(self) -> InputPort:

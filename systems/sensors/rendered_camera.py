@@ -28,6 +28,7 @@ class RenderedCamera(MountedCamera):
         input_ports:
         - query_object
         - spatial_velocity
+        - active
         output_ports:
         - image
 
@@ -50,6 +51,7 @@ class RenderedCamera(MountedCamera):
         query_object (input, QueryObject): SceneGraph's `query`.
         spatial_velocity (input, vector of 6): of the body in W, rotation first (rad/s, m/s); needed
             only for motion blur (exposure_samples > 1).
+        active (input, vector of 1): while it is 0 no pictures are taken; may be left unconnected.
         image (output, CameraImage): uint8 grey or RGB, at `rate`, `latency` after its stamp; a
             picture of size 0 with stamp NaN before the first.
 

@@ -7,7 +7,14 @@ from abc import abstractmethod
 from typing import Any
 
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, EventStatus, LeafSystem, OutputPort, State
+from pydrake.systems.framework import (
+    Context,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    State,
+)
 
 from systems.messages import Message, whole_nanoseconds
 from systems.noise import sample_index
@@ -35,8 +42,9 @@ class SampledSensor(LeafSystem):
         latency: float,
         nothing: Message,
         clock_error: float = 0.0,
+        switchable: bool = False,
     ) -> OutputPort:
-        """Declares state, events and the output port.
+        """Declares state, events and the output port, perhaps an input to switch it off.
 
         Args:
             name: name of the output port.
@@ -46,6 +54,8 @@ class SampledSensor(LeafSystem):
             clock_error: by how much the stamps are late on the clock of all others, s: what is
                 measured at t is said to be of t + clock_error. At most `latency`, as nothing may
                 come from the future.
+            switchable: whether it has an input `active` (vector of 1): while that is 0 nothing is
+                measured; unconnected, it measures.
 
         Returns:
             The output port. It changes only when a message arrives.
@@ -60,6 +70,7 @@ class SampledSensor(LeafSystem):
         self.rate = rate
         self.latency = latency
         self.clock_error = clock_error
+        self._active_input = self.DeclareVectorInputPort("active", 1) if switchable else None
         self._delivered = self.DeclareAbstractState(AbstractValue.Make(nothing))
         self._under_way = self.DeclareAbstractState(AbstractValue.Make(()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._take)
@@ -89,7 +100,18 @@ class SampledSensor(LeafSystem):
         """Returns the time t (s) by the sensor's clock, in whole nanoseconds."""
         return whole_nanoseconds(t + self.clock_error)
 
+    def active_input_port(self) -> InputPort:
+        """Returns the port that switches it off and on, of one that is `switchable`."""
+        assert self._active_input is not None
+        return self._active_input
+
+    def _is_off(self, context: Context) -> bool:
+        port = self._active_input
+        return port is not None and port.HasValue(context) and not port.Eval(context)[0] > 0
+
     def _take(self, context: Context, state: State) -> EventStatus:
+        if self._is_off(context):
+            return EventStatus.DidNothing()
         t = context.get_time()
         message = self._measure(context, self._stamp(t), sample_index(t, self.rate))
         slot = self._slot(state, self._under_way)
@@ -100,7 +122,7 @@ class SampledSensor(LeafSystem):
         slot = self._slot(state, self._under_way)
         now = context.get_time() + 2 * _EARLY
         arrived = [message for due, message in slot.get_value() if due <= now]
-        if not arrived:  # the simulation started late: there was no sample for this time
+        if not arrived:  # it was off, or the simulation started late: there was no sample
             return EventStatus.DidNothing()
         slot.set_value(slot.get_value()[len(arrived) :])
         self._slot(state, self._delivered).set_value(arrived[-1])

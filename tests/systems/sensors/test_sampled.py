@@ -15,7 +15,7 @@ from systems.cameras import PinholeCamera
 from systems.flow.projector import FlowProjector
 from systems.markers.family import family
 from systems.markers.projector import MarkerProjector
-from systems.messages import Message
+from systems.messages import Detections, Message
 from systems.sensors.drawn_camera import DrawnCamera
 from systems.sensors.rendered_camera import RenderedCamera
 from systems.sensors.sampled import SampledSensor
@@ -200,3 +200,33 @@ def test_nonsense_is_refused(field: str, value: float) -> None:
     arguments: dict[str, Any] = {"rate": 10.0, "latency": 0.0} | {field: value}
     with pytest.raises(ValueError, match=f"{field} is {value}: must be "):
         Clock(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("active", "taken"), [(None, 6), (1.0, 6), (0.0, 0), (math.nan, 0)], ids=str
+)
+def test_a_camera_that_is_switched_off_measures_nothing(active: float | None, taken: int) -> None:
+    projector = MarkerProjector(
+        camera=CAMERA, markers=[], family=family("DICT_4X4_50"), rate=60.0, **MOUNTED
+    )
+    measured: list[float] = []
+    projector._measure = lambda _, stamp, __: measured.append(stamp) or Detections(stamp)  # type: ignore[assignment,func-returns-value]
+    simulator = Simulator(projector)
+    if active is not None:
+        projector.active_input_port().FixValue(simulator.get_mutable_context(), [active])
+    simulator.AdvanceTo(0.09)
+    assert len(measured) == taken
+
+
+def test_what_is_under_way_arrives_after_it_was_switched_off() -> None:
+    projector = MarkerProjector(
+        camera=CAMERA, markers=[], family=family("DICT_4X4_50"), rate=10.0, latency=0.05, **MOUNTED
+    )
+    projector._measure = lambda _, stamp, __: Detections(stamp)  # type: ignore[assignment]
+    simulator = Simulator(projector)
+    context = simulator.get_mutable_context()
+    switch = projector.active_input_port().FixValue(context, [1.0])
+    simulator.AdvanceTo(0.01)
+    switch.GetMutableData().get_mutable_value().SetFromVector([0.0])
+    simulator.AdvanceTo(0.4)
+    assert projector.detections_output_port().Eval(context).stamp == 0.0
