@@ -28,6 +28,8 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
+_SLIDING = 0.2  # s, that a margin below 1 has to last
+
 
 class ShellMission(Mission):
     """The wired diagram of a `SnailBotScenario`.
@@ -88,11 +90,12 @@ class ShellMission(Mission):
         wiring.log("chain.covariance")
 
     def outcome(self, context: Context) -> str | None:
-        """Returns `detached` when a robot has come off, `reached` when all have driven their way.
+        """Returns `detached` when a robot has lost its hold, `reached` when all drove their way.
 
-        A team that only stands goes on until the time is up.
+        A robot has lost its hold when it has come off, or when for a while its adhesion was less
+        than it needs: then it slides down. A team that only stands goes on until the time is up.
         """
-        if any(robot.detached(context) for robot in self.robots):
+        if any(robot.detached(context) or self._slides(context, robot) for robot in self.robots):
             return "detached"
         driving = [robot for robot in self.robots if robot.legs]
         done = driving and all(robot.finished(context) for robot in driving)
@@ -187,6 +190,14 @@ class ShellMission(Mission):
             visible=np.all([log.visible for log in known], axis=0),
             markers_met=np.min([log.markers_met for log in known], axis=0),
         )
+
+    def _slides(self, context: Context, robot: ShellRobot) -> bool:
+        name = f"truth.{robot.name}.margin"
+        if name not in self.logs:
+            return False
+        t, margin = self.log(name, context)
+        held = t[margin[:, 0] >= 1]
+        return len(t) > 0 and t[-1] - (held[-1] if len(held) else t[0]) >= _SLIDING
 
     def _least_margin(self, context: Context, robot: ShellRobot) -> float | None:
         name = f"truth.{robot.name}.margin"

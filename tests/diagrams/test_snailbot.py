@@ -320,11 +320,11 @@ def test_magnets_that_are_too_weak_let_go(tagtrail: Command, tmp_path: Path) -> 
 
 def test_wheels_that_are_too_slippery_slide_down() -> None:
     finished = run(CLIMB, "world.shell.friction=0.05", "duration=2.0")
-    assert finished.report["outcome"] != "reached"
+    assert finished.report["outcome"] == "detached"
     assert not finished.succeeded
     assert finished.report["metrics"]["min_adhesion_margin"] < 1
     log = log_of(finished)
-    assert log.p[-1, 2] < -0.02  # it was to go up
+    assert log.p[-1, 2] < -0.005  # it was to go up
 
 
 def test_a_robot_may_just_stand() -> None:
