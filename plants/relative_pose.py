@@ -59,5 +59,5 @@ class RelativePose(LeafSystem):
     def _calc_pose(self, context: Context, output: Any) -> None:
         query = self._query_input.Eval(context)
         X_WP, X_WC = (query.GetPoseInWorld(frame) for frame in (self._parent, self._child))
-        X_PC = X_WP.inverse() @ X_WC
+        X_PC = X_WP.InvertAndCompose(X_WC)
         output.set_value(X_PC if self._X_CF is None else X_PC @ self._X_CF)

@@ -219,7 +219,7 @@ class RockingBody(LeafSystem):
         self._pose_output = self.DeclareAbstractOutputPort(
             "pose",
             lambda: AbstractValue.Make(RigidTransform()),
-            lambda context, output: output.set_value(self._X_WB(context)),
+            self._calc_pose,
             set(tickets[:2]),
         )
         self._velocity_output = self.DeclareVectorOutputPort(
@@ -275,37 +275,33 @@ class RockingBody(LeafSystem):
         (waves,) = self._waves.Eval(context)
         output.set_value([tilted(*tilt(waves, context.get_time()))])
 
-    def _in_chassis(self, context: Context) -> tuple[Array, Array, Array]:
-        """Returns rotation, angular velocity and acceleration of B in B0, told there."""
-        motion: tuple[Array, Array, Array] = self._motion.Eval(context)[0]
-        return motion
-
-    def _X_WB(self, context: Context) -> RigidTransform:
-        rotation = RotationMatrix(self._in_chassis(context)[0])
+    def _calc_pose(self, context: Context, output: AbstractValue) -> None:
         X_WB0: RigidTransform = self._pose_input.Eval(context)
-        return RigidTransform(X_WB0.rotation().multiply(rotation), X_WB0.translation())
+        R_B0B, _, _ = self._motion.Eval(context)[0]
+        R_WB = RotationMatrix(X_WB0.rotation().matrix() @ R_B0B)
+        output.set_value(RigidTransform(R_WB, X_WB0.translation()))
 
     def _calc_velocity(self, context: Context, output: Any) -> None:
         V = self._velocity_input.Eval(context).copy()
-        R_WB0 = self._pose_input.Eval(context).rotation()
-        V[:3] += R_WB0.multiply(self._in_chassis(context)[1])
+        _, w, _ = self._motion.Eval(context)[0]
+        V[:3] += self._pose_input.Eval(context).rotation().matrix() @ w
         output.SetFromVector(V)
 
     def _calc_acceleration(self, context: Context, output: Any) -> None:
         A = self._acceleration_input.Eval(context).copy()
-        _, w, alpha = self._in_chassis(context)
-        R_WB0 = self._pose_input.Eval(context).rotation()
+        _, w, alpha = self._motion.Eval(context)[0]
+        R_WB0 = self._pose_input.Eval(context).rotation().matrix()
         x, y, z = self._velocity_input.Eval(context)[:3].tolist()
-        u, v, s = R_WB0.multiply(w).tolist()
+        u, v, s = (R_WB0 @ w).tolist()
         # What turns with the chassis turns: the Coriolis part.
-        A[:3] += R_WB0.multiply(alpha)
+        A[:3] += R_WB0 @ alpha
         A[:3] += [y * s - z * v, z * u - x * s, x * v - y * u]
         output.SetFromVector(A)
 
     def _calc_frame_pose(self, context: Context, output: AbstractValue) -> None:
         poses = FramePoseVector()
         if self._frame_id is not None:
-            poses.set_value(self._frame_id, self._X_WB(context))
+            poses.set_value(self._frame_id, self._pose_output.Eval(context))
         output.set_value(poses)
 
     @staticmethod

@@ -130,10 +130,10 @@ def expose(image: Image, effects: ImageEffects, rng: np.random.Generator) -> Ima
     if noisy:
         variance = effects.read_noise**2 + effects.shot_noise**2 / 255 * levels
         light += cv2.LUT(image, np.sqrt(variance)) * coarse_normals(rng, light.shape)
-    light = light.clip(0, 255)
+    np.clip(light, 0, 255, out=light)
     if effects.gamma != 1:
         light = 255 * (light / 255) ** np.float32(1 / effects.gamma)
-    return np.rint(light).astype(np.uint8)
+    return np.rint(light, out=light).astype(np.uint8)
 
 
 def linear_light(image: Image) -> Image:

@@ -153,7 +153,7 @@ class SnailBotBody:
         )
         station.connect(plant.get_body_poses_output_port(), adhesion.body_poses_input_port())
         station.pulls.append(adhesion.forces_output_port())
-        for name, rate in (("margin", 50.0), ("detached", 10.0)):
+        for name, rate in (("margin", 10.0), ("detached", 10.0)):
             signal = number_signal(f"truth.{robot.name}.{name}", rate)
             station.export_output(adhesion.GetOutputPort(name), signal.port, signal)
 
@@ -173,7 +173,7 @@ class SnailBotBody:
         name = robot.name
         for signal in (
             shell_truth_signal(name),
-            number_signal(f"truth.{name}.margin", 50.0),
+            number_signal(f"truth.{name}.margin", 10.0),
             number_signal(f"truth.{name}.detached", 10.0),
         ):
             port: OutputPort | None = station.play(signal, optional=True)

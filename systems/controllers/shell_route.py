@@ -122,13 +122,13 @@ def on_leg(R_RB: Array, R_RL: Array) -> OnLeg:
 
     At the two poles of the great circle, 90 degrees off it, there is no direction: it is 0.
     """
-    x, y, z = R_RL.T @ R_RB[:, 2]
-    # The direction in which `along` grows: y_L x z_B.
-    forward = R_RB.T @ np.cross(R_RL[:, 1], R_RB[:, 2])
+    # The robot as seen from the start of the leg; its z_B is where it stands.
+    (ax, bx, x), (_, _, y), (az, bz, z) = (R_RL.T @ R_RB).tolist()
+    # `along` grows in the direction y_L x z_B = (z, 0, -x), which is to be seen from the robot.
     return OnLeg(
         along=math.atan2(x, z),
         left=math.asin(min(max(y, -1.0), 1.0)),
-        heading=math.atan2(forward[1], forward[0]),
+        heading=math.atan2(z * bx - x * bz, z * ax - x * az),
     )
 
 

@@ -110,6 +110,17 @@ class DrawnShell:
             )
 
     @cached_property
+    def marker_places(self) -> tuple[Array, Array]:
+        """Directions of the markers' middles (n, 3), and how far around they reach (n,) rad."""
+        if self.markers is None:
+            return np.zeros((0, 3)), np.zeros(0)
+        margins = 1 + 2 * self.parameters.margin / self.markers.family.cells
+        sides = np.array([marker.size for marker in self.markers]) * margins
+        middles = np.array([marker.X_WM.translation() for marker in self.markers]).reshape(-1, 3)
+        middles /= np.linalg.norm(middles, axis=1, keepdims=True)
+        return middles, sides / np.sqrt(2) / self.radius
+
+    @cached_property
     def holes(self) -> Array:
         """Middles of the holes: (n, 3) of unit length."""
         middles, _, _ = _rows(self.parameters.hole_pitch / self.radius)
@@ -294,17 +305,16 @@ class _Look:
 
     def markers(self) -> list[Layer]:
         """The markers, each bent onto the sphere."""
-        markers, p = self.shell.markers, self.parameters
+        markers = self.shell.markers
+        if markers is None:
+            return []
+        family = markers.family
         layers: list[Layer] = []
-        for marker in markers or ():
-            assert markers is not None
-            cells = markers.family.cells
-            reach = marker.size * (1 + 2 * p.margin / cells) / np.sqrt(2) / self.shell.radius
-            middle = marker.X_WM.translation() / np.linalg.norm(marker.X_WM.translation())
-            if not self._in_sight(middle[None], reach)[0]:
-                continue
-            sheet = marker_sheet(markers.family, marker.id, p.margin)
-            layers.extend(self._marker(marker, sheet, marker.size / cells))
+        in_sight = self._in_sight(*self.shell.marker_places)
+        for marker, visible in zip(markers, in_sight.tolist(), strict=True):
+            if visible:
+                sheet = marker_sheet(family, marker.id, self.parameters.margin)
+                layers += self._marker(marker, sheet, marker.size / family.cells)
         return layers
 
     def _marker(self, marker: Marker, sheet: Sheet, cell: float) -> list[Layer]:
@@ -328,8 +338,8 @@ class _Look:
             return []
         return [Layer(box, Edges(begin[rim], finish[rim], cover), (edges,))]
 
-    def _in_sight(self, places: Array, reach: float) -> NDArray[np.bool_]:
-        """Whether what reaches `reach` (rad) around unit vectors may be in the picture."""
+    def _in_sight(self, places: Array, reach: Array | float) -> NDArray[np.bool_]:
+        """Whether what reaches `reach` (rad) around unit vectors (n, 3) may be in the picture."""
         away = self.eye / np.linalg.norm(self.eye)
         visible = places @ away > self.horizon
         if not visible.any():
@@ -337,7 +347,8 @@ class _Look:
         seen = np.flatnonzero(visible)
         p_C = self.shell.radius * (places[seen] @ self.R.T) + self.centre
         ahead = p_C[:, 2] > NEAREST
-        grown = reach * self.shell.radius * float(self.camera.K[[0, 1], [0, 1]].max())
+        grown = np.broadcast_to(reach, len(places))[seen] * self.shell.radius
+        grown *= float(self.camera.K[[0, 1], [0, 1]].max())
         pixels = np.full((len(seen), 2), np.inf)
         pixels[ahead] = self.camera.project(p_C[ahead])
         slack = grown / np.maximum(p_C[:, 2], NEAREST)

@@ -11,6 +11,7 @@ Kept in one array, so that it can be a system's discrete state; no Drake here.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,10 +20,11 @@ from systems.estimators.shell_model import Turn
 
 Array = NDArray[np.float64]
 
-# A row: number of the sample, integrals of gyro, reference and time without a gyro, then the gyro.
-_INDEX, _SUMS, _LOST, _GYRO, _REFERENCE = 0, slice(1, 8), 7, slice(8, 11), slice(11, 14)
+# A row: number of the sample; integrals of gyro, reference and time without a gyro; the two rates.
+_INDEX, _SUMS, _RATES = 0, slice(1, 8), slice(8, 14)
 WIDTH = 14
 _RATE_WINDOW = 0.01  # s, over which a momentary rate is averaged
+_WINDOW = np.array([0.0, -_RATE_WINDOW / 2, _RATE_WINDOW / 2])
 
 
 def rows_for(duration: float, rate: float) -> int:
@@ -44,31 +46,30 @@ class RateTrail:
         self._rate = rate
         self._age = age
 
-    def add(self, k: int, gyro: Array, reference: Array, lost: bool) -> None:
+    def add(self, k: int, gyro: Sequence[float], reference: Sequence[float], lost: bool) -> None:
         """Adds the rates of sample k; after a gap the trail begins anew.
 
         Args:
             k: number of the sample.
-            gyro: (3,) rad/s.
-            reference: (3,) rad/s, in another frame.
+            gyro: 3 numbers, rad/s.
+            reference: 3 numbers, rad/s, in another frame.
             lost: whether the gyro is only a guess.
         """
         n = len(self._rows)
-        before = self._rows[(k - 1) % n]
-        row = self._rows[k % n]
-        if before[_INDEX] == k - 1:
-            rates = np.concatenate([gyro, reference, [0.0]])
-            rates[:6] = (rates[:6] + before[8:14]) / 2
-            rates[6] = lost
-            row[_SUMS] = before[_SUMS] + rates / self._rate
+        index, *before = self._rows[(k - 1) % n].tolist()
+        rates = (*gyro, *reference)
+        if index == k - 1:
+            half, dt = 0.5 / self._rate, 1.0 / self._rate
+            trapezes = [half * (a + b) for a, b in zip(rates, before[7:], strict=True)]
+            sums = [a + b for a, b in zip(before[:7], (*trapezes, lost * dt), strict=True)]
         else:
             self._rows[:] = np.nan
-            row[_SUMS] = 0.0
-        row[_INDEX], row[_GYRO], row[_REFERENCE] = k, gyro, reference
+            sums = [0.0] * 7
+        self._rows[k % n] = (k, *sums, *rates)
 
     def newest(self) -> int:
         """Returns the number of the last sample."""
-        return int(np.nanmax(self._rows[:, _INDEX]))
+        return int(np.fmax.reduce(self._rows[:, _INDEX]))
 
     def between(self, start: float, end: float, newest: int) -> Turn:
         """Returns the turn from one moment to another, which may be earlier.
@@ -80,43 +81,32 @@ class RateTrail:
             end: s.
             newest: number of the last sample.
         """
-        a, b = self._sums(start, newest), self._sums(end, newest)
-        d = b - a
-        lost = max(abs(end - start) - abs(self._inside(end, newest) - self._inside(start, newest)),
-                   0.0)  # fmt: skip
+        oldest = self._oldest(newest)
+        sums = self._sums(np.array([start, end])[:, None] + _WINDOW, oldest, newest)
+        turn = (sums[1, 0] - sums[0, 0]).tolist()
+        rates = (sums[:, 2, :3] - sums[:, 1, :3]) / _RATE_WINDOW
+        begin = oldest / self._rate - self._age
+        known = abs(max(end, begin) - max(start, begin))
+        lost = max(abs(end - start) - known, 0.0)
         return Turn(
-            d[:3], d[3:6], end - start,
-            self._rate_at(start, newest), self._rate_at(end, newest), abs(d[6]) + lost,
+            np.array(turn[:3]), np.array(turn[3:6]), end - start,
+            rates[0], rates[1], abs(turn[6]) + lost,
         )  # fmt: skip
 
     def _oldest(self, newest: int) -> int:
         n = len(self._rows)
         k = newest - n + 1
-        return k if self._rows[k % n, _INDEX] == k else int(np.nanmin(self._rows[:, _INDEX]))
+        full = self._rows[k % n, _INDEX] == k
+        return k if full else int(np.fmin.reduce(self._rows[:, _INDEX]))
 
-    def _inside(self, t: float, newest: int) -> float:
-        """Returns t, or the oldest moment of the memory if that is later."""
-        return max(t, self._oldest(newest) / self._rate - self._age)
-
-    def _sums(self, t: float, newest: int) -> Array:
-        n = len(self._rows)
-        place = (t + self._age) * self._rate
-        last = self._rows[newest % n]
-        if place >= newest:
-            rest = np.concatenate([last[8:14], [0.0]])
-            held: Array = last[_SUMS] + rest * ((place - newest) / self._rate)
-            return held
-        oldest = self._oldest(newest)
-        place = max(place, float(oldest))
-        k = min(math.floor(place), newest - 1)
-        if k < oldest:
-            only: Array = last[_SUMS].copy()
-            return only
-        before, after = self._rows[k % n, _SUMS], self._rows[(k + 1) % n, _SUMS]
-        between: Array = before + (place - k) * (after - before)
-        return between
-
-    def _rate_at(self, t: float, newest: int) -> Array:
-        d = self._sums(t + _RATE_WINDOW / 2, newest) - self._sums(t - _RATE_WINDOW / 2, newest)
-        rate: Array = d[:3] / _RATE_WINDOW
-        return rate
+    def _sums(self, moments: Array, oldest: int, newest: int) -> Array:
+        """Returns the integrals (..., 7) up to moments (...) s; before the memory its first."""
+        rows, n = self._rows, len(self._rows)
+        place = (moments + self._age) * self._rate
+        within = np.minimum(np.maximum(place, oldest), newest)
+        k = within.astype(np.intp)
+        before, after = rows[k % n, _SUMS], rows[np.minimum(k + 1, newest) % n, _SUMS]
+        sums: Array = before + (within - k)[..., None] * (after - before)
+        beyond = np.maximum(place - newest, 0.0) / self._rate
+        sums[..., :6] += beyond[..., None] * rows[newest % n, _RATES]
+        return sums

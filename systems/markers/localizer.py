@@ -157,7 +157,7 @@ class MapLocalizer:
     def locate(self, detections: Detections) -> Localization:
         """Solves the body's pose from one picture's detections; never NaN, never an exception."""
         dropped = dict.fromkeys(REASONS, 0)
-        seen = self._usable(detections, dropped)
+        seen = self._usable(detections, dropped) if len(detections) else detections
         nothing = PoseEstimate(frame_id=self.marker_map.frame, child_frame_id=self.body_frame)
         if len(seen) == 0:
             return Localization(nothing, nothing, dropped)

@@ -150,11 +150,17 @@ class MissedPassages(LeafSystem):
         return detections, passages[-_MANY:], number
 
     def _calc_seen(self, context: Context, output: Any) -> None:
-        detections, passages, _ = self._after(context)
+        detections: Detections = self._detections_input.Eval(context)
+        if not len(detections):
+            output.set_value(detections)
+            return
+        _, passages, _ = self._after(context)
         hidden = np.isin(detections.ids, passages[passages[:, _MISSED] == 1, _ID])
         output.set_value(detections.select(~hidden) if hidden.any() else detections)
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
+        if not len(self._detections_input.Eval(context)):  # the passages end by the time
+            return
         detections, passages, number = self._after(context)
         past, before = context.get_discrete_state(self._past).get_value().tolist()
         if math.isnan(detections.stamp) or detections.stamp == past:

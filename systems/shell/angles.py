@@ -31,6 +31,7 @@ SHELL_FRAME = "shell"  # the name that frame R has in messages and marker maps
 _R_0 = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 # Nearer to a pole than this (cosine of the pitch), rounding decides what yaw is.
 _AT_POLE = 1e-9
+_SMALL = 1e-8  # rad^2; below, the series' next terms round away
 
 
 def upright(pitch: Array | float, yaw: Array | float) -> Array:
@@ -127,7 +128,7 @@ def rotation_vector(R: Array) -> Array:
 
 
 def _one_rotation_vector(R: Array) -> Array:
-    """Returns the same of a single rotation (3, 3): in plain floats it takes a tenth of the time."""
+    """Returns the same of a single rotation (3, 3): plain floats take a tenth of the time."""
     (a, ab, ac), (ba, b, bc), (ca, cb, c) = R.tolist()
     x, y, z = cb - bc, ac - ca, ba - ab
     rows = (
@@ -145,6 +146,31 @@ def _one_rotation_vector(R: Array) -> Array:
     return np.array([scale * x, scale * y, scale * z])
 
 
+def one_rotation(w: Array) -> Array:
+    """Returns exp([w]x) (3, 3) of a single rotation vector (3,) rad (Rodrigues).
+
+    In plain floats; `systems.markers.pnp.rotation_from_vector` is for many.
+    """
+    x, y, z = w.tolist()
+    square = x * x + y * y + z * z
+    if square > _SMALL:
+        angle = math.sqrt(square)
+        half = math.sin(angle / 2) / angle
+        a, b = math.sin(angle) / angle, 2 * half * half
+    else:
+        a, b = 1 - square / 6, 0.5 - square / 24
+    c = 1 - b * square
+    bxy, bxz, byz = b * x * y, b * x * z, b * y * z
+    ax, ay, az = a * x, a * y, a * z
+    return np.array(
+        [
+            [c + b * x * x, bxy - az, bxz + ay],
+            [bxy + az, c + b * y * y, byz - ax],
+            [bxz - ay, byz + ax, c + b * z * z],
+        ]
+    )
+
+
 def rotation_error(R_estimate: Array, R_true: Array) -> Array:
     """Returns phi (..., 3) rad in R with R_estimate = exp([phi]x) R_true: the estimate's error."""
     return rotation_vector(R_estimate @ np.swapaxes(R_true, -1, -2))
@@ -160,4 +186,4 @@ def angle_differences(R_estimate: Array, R_true: Array) -> Array:
 
 def nearest_rotation(R: Array) -> Array:
     """Returns the rotation (..., 3, 3) next to a product of rotations, which rounding has bent."""
-    return np.asarray(1.5 * R - 0.5 * R @ (np.swapaxes(R, -1, -2) @ R))  # a Newton step
+    return np.asarray(1.5 * R - 0.5 * R @ (R.swapaxes(-1, -2) @ R))  # a Newton step

@@ -68,7 +68,7 @@ class MarkersSeen(LeafSystem):
         stamp, pictures, shown = context.get_discrete_state(self._pictures).get_value()
         if math.isnan(detections.stamp) or detections.stamp == stamp:
             return
-        known = np.isin(self._ids, detections.ids)
+        known = (self._ids[:, None] == detections.ids).any(axis=1)
         met = np.maximum(context.get_discrete_state(self._met).get_value(), known)
         pictures, shown = pictures + 1, shown + known.any()
         discrete_state.set_value(self._met, met)

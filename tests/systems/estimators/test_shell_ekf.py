@@ -367,11 +367,25 @@ def test_bad_arguments_are_refused(arguments: dict[str, object], message: str) -
         ({"mounting_std": -1.0}, "mounting_std is -1.0"),
         ({"height_noise": -1.0}, "height_noise is -1.0"),
         ({"imu_age": 1.0}, "imu_age is 1.0: must be less than the horizon"),
+        ({"imu_age": -0.001}, "imu_age is -0.001: must be less than the horizon"),
+        ({"imu_age": math.nan}, "imu_age is nan: must be less than the horizon"),
     ],
 )
 def test_bad_parameters_are_refused(parameters: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         ShellEkfParameters(**parameters)  # type: ignore[arg-type]
+
+
+def test_a_sample_is_one_tick_old_unless_it_is_said_how_old() -> None:
+    told = []
+    for parameters in ({}, {"imu_age": None}, {"imu_age": 1 / RATE}, {"imu_age": 0.0}):
+        rig = Rig(**parameters)
+        rig.go(0.3, flow=True, marker=True)
+        rig.go(0.2, command=(0.03, 0.5))
+        told.append(rig.estimate.GetAsMatrix34())
+    np.testing.assert_array_equal(told[0], told[1])
+    np.testing.assert_array_equal(told[0], told[2])
+    assert np.abs(told[0] - told[3]).max() > 1e-5
 
 
 # --- The paper's routine with the base errors ---

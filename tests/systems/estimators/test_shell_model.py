@@ -7,7 +7,6 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
-from systems.estimators.rate_trail import WIDTH, RateTrail, rows_for
 from systems.estimators.shell_ekf_parameters import ShellEkfParameters
 from systems.estimators.shell_model import (
     BIAS,
@@ -238,27 +237,3 @@ def test_a_correction_is_that_of_the_joseph_form() -> None:
 
 
 # --- The trail ---
-
-
-def test_the_trail_gives_the_integral_between_any_two_moments() -> None:
-    rows = np.full((rows_for(0.5, 300.0), WIDTH), np.nan)
-    trail = RateTrail(rows, rate=300.0, age=1 / 300)
-
-    def rate(t: float) -> np.ndarray:
-        return np.array([math.sin(3 * t), 1.0, t])
-
-    def integral(t: float) -> np.ndarray:
-        return np.array([-math.cos(3 * t) / 3, t, t * t / 2])
-
-    for k in range(400):
-        trail.add(k, rate((k - 1) / 300), np.array([0.0, 0.0, 2.0]), lost=200 <= k < 230)
-    for start, end in ((1.0, 1.05), (1.2345, 1.0123), (1.31, 1.3266)):
-        turn = trail.between(start, end, 399)
-        np.testing.assert_allclose(turn.gyro, integral(end) - integral(start), atol=2e-5)
-        np.testing.assert_allclose(turn.reference, [0, 0, 2 * (end - start)], atol=1e-12)
-        assert turn.lost == 0.0
-        np.testing.assert_allclose(turn.rate_before, rate(start), atol=1e-2)
-    ahead = trail.between(1.3, 1.36, 399)  # beyond the last sample, of 398 / 300 s
-    np.testing.assert_allclose(ahead.gyro, integral(1.36) - integral(1.3), atol=5e-3)
-    assert trail.newest() == 399
-    assert trail.between(0.2, 0.9, 399).lost == pytest.approx(0.9 - 0.2, abs=0.15)

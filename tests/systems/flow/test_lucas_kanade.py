@@ -62,6 +62,30 @@ def test_at_most_so_many_corners_the_surest_ones() -> None:
     np.testing.assert_array_equal(few, all_of_them[:10])
 
 
+@pytest.mark.parametrize("decimate", [1.0, 1.5, 2.0, 3.0])
+def test_corners_are_where_they_are_however_the_picture_is_reduced(decimate: float) -> None:
+    image = np.full((90, 180), 60, np.uint8)
+    image[36:, 72:] = 200  # one corner, between pixels (71, 35) and (72, 36)
+    parameters = LucasKanadeParameters(decimate=decimate, quality=0.5, max_points=1)
+    (found,) = corners(image, parameters)
+    np.testing.assert_allclose(found, [71.5, 35.5], atol=decimate)
+
+
+def test_of_noise_a_reduced_picture_makes_fewer_corners() -> None:
+    clean = np.full((120, 160), 100.0)
+    clean[40:80, 60:100] = 120.0  # its four corners, and noise all over
+    noise = np.random.default_rng(3).normal(0, 1.5, clean.shape)
+    image = np.clip(clean + noise, 0, 255).astype(np.uint8)
+    true = np.array([[59.5, 39.5], [99.5, 39.5], [59.5, 79.5], [99.5, 79.5]])
+    wrong = []
+    for decimate in (1.0, 2.0):
+        found = corners(image, LucasKanadeParameters(decimate=decimate))
+        near = np.linalg.norm(found[:, None] - true, axis=2).min(axis=1) <= 4.0
+        assert near.sum() == 4
+        wrong.append(int((~near).sum()))
+    assert wrong[1] < 0.1 * wrong[0]
+
+
 def test_a_point_that_looks_different_now_fails_the_error_test() -> None:
     before, after = texture(), texture(1.0, 0.0)
     rng = np.random.default_rng(1)
@@ -138,6 +162,7 @@ def test_the_history_integrates_the_rate() -> None:
     [
         ({"max_points": 0}, "max_points is 0: must be 1 or greater"),
         ({"quality": 1.0}, "quality is 1.0: must be between 0 and 1"),
+        ({"decimate": 0.5}, "decimate is 0.5: must be 1 or greater"),
         ({"window": 20}, "window is 20: must be odd, 5 or greater"),
         ({"levels": -1}, "levels is -1: must be 0 to 8"),
         ({"predicted_levels": 9}, "predicted_levels is 9: must be 0 to 8"),

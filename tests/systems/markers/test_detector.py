@@ -116,15 +116,43 @@ def test_large_boards_are_not_taken_for_their_markers() -> None:
     assert missed > 0
 
 
-def test_decimation_reaches_the_engine() -> None:
-    image, sheets = scene("tag36h11", seed=2)
-    whole = MarkerDetector(family="tag36h11").detect(image)
+@ENGINES
+def test_decimation_reaches_the_engine(name: str) -> None:
+    image, sheets = scene(name, seed=2)
+    whole = MarkerDetector(family=name).detect(image)
     parameters = DetectorParameters(decimate=4.0)
-    reduced = MarkerDetector(family="tag36h11", parameters=parameters).detect(image)
-    assert len(reduced) < len(whole) == len(sheets)
+    reduced = MarkerDetector(family=name, parameters=parameters).detect(image)
+    assert 0 < len(reduced) < len(whole) == len(sheets)
     for marker_id, corners in zip(reduced.ids, reduced.corners, strict=True):
         # Starts from a picture a quarter the size end in the same corners.
         np.testing.assert_allclose(corners, sheets[marker_id].corners(), atol=0.1)
+
+
+@pytest.mark.parametrize("decimate", [1.5, 2.0, 3.0])
+def test_large_markers_are_found_in_a_smaller_picture_up_to_its_border(decimate: float) -> None:
+    small = MarkerDetector(
+        family="DICT_4X4_50", parameters=DetectorParameters(decimate=decimate, refine=False)
+    )
+    upright = printed("DICT_4X4_50", 7, cell=20, margin=1)
+    size = len(upright)
+    for left, top in ((0, 0), (640 - size, 480 - size), (201, 143)):
+        image = np.full((480, 640), 128, np.uint8)
+        image[top : top + size, left : left + size] = upright
+        found = small.detect(image)
+        assert found.ids.tolist() == [7]
+        # The engine's quadrangles lie half a pixel inside, of its own picture; no other shift.
+        low, high = np.array([left, top]) + 19.5, np.array([left, top]) + size - 20.5
+        corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
+        np.testing.assert_allclose(found.corners[0], corners, atol=1.2 * decimate)
+        np.testing.assert_allclose(
+            found.corners[0].mean(axis=0), corners.mean(axis=0), atol=0.3 * decimate
+        )
+
+
+def test_a_picture_is_not_reduced_below_what_an_engine_takes() -> None:
+    parameters = DetectorParameters(decimate=1000.0)
+    detector = MarkerDetector(family="DICT_4X4_50", parameters=parameters)
+    assert len(detector.detect(printed("DICT_4X4_50", 7))) == 0
 
 
 def with_flipped_cell(name: str, marker_id: int) -> Grey:

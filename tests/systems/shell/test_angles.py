@@ -12,6 +12,7 @@ from systems.shell.angles import (
     angles_defined,
     angles_of,
     nearest_rotation,
+    one_rotation,
     rotation,
     rotation_error,
     rotation_vector,
@@ -147,6 +148,15 @@ def test_rotation_vectors_are_scipys_at_every_angle() -> None:
     np.testing.assert_array_equal(rotation_vector(np.eye(3)), 0.0)
     half_turns = rotation_vector(np.array([np.diag([1.0, -1, -1]), np.diag([-1.0, -1, 1])]))
     np.testing.assert_allclose(half_turns, [[np.pi, 0, 0], [0, 0, np.pi]], atol=1e-15)
+
+
+def test_one_rotation_is_scipys_at_every_angle() -> None:
+    rng = np.random.default_rng(5)
+    for angle in (0.0, 1e-12, 1e-5, 0.99e-4, 1.01e-4, 1e-3, 0.1, 1.0, 3.0, np.pi, 6.0):
+        axis = rng.standard_normal(3)
+        w = angle * axis / np.linalg.norm(axis)
+        R = one_rotation(w)
+        np.testing.assert_allclose(R, Rotation.from_rotvec(w).as_matrix(), rtol=0, atol=4e-15)
 
 
 def test_the_error_is_a_rotation_in_the_spheres_frame() -> None:
