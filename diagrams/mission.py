@@ -105,6 +105,10 @@ class Wiring:
         block, _, port = name.partition(".")
         return block in self._blocks and port in _port_names(self._blocks[block], "Output")
 
+    def has_input(self, name: str) -> bool:
+        """Whether the station has such an input port."""
+        return name in _port_names(self.station, "Input")
+
     def has_block(self, name: str) -> bool:
         """Whether a block was added under that name."""
         return name in self._blocks

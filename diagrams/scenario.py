@@ -35,6 +35,7 @@ from systems.validation import nearest, require, require_positive
 MISSIONS = Table(
     "mission",
     {
+        "formation": "diagrams.formation:FormationScenario",
         "navigation": "diagrams.navigation:NavigationScenario",
         "snailbot": "diagrams.snailbot:SnailBotScenario",
     },

@@ -73,9 +73,12 @@ from systems.cameras import PinholeCamera
 from systems.controllers.collision_monitor import CollisionMonitor
 from systems.controllers.search import SearchWhenLost
 from systems.controllers.shell_route import Leg, ShellRoute
+from systems.controllers.triangle_algorithm1 import TriangleAlgorithm1
+from systems.controllers.triangle_resection import TriangleResection
 from systems.controllers.waypoints import WaypointController
 from systems.controllers.wheel_drive import WheelDrive
 from systems.controllers.wheel_pwm import WheelPwm
+from systems.estimators.formation_filter import FormationFilter
 from systems.estimators.gyro_yaw import GyroYaw
 from systems.estimators.madgwick import Madgwick
 from systems.estimators.planar_ekf import PlanarEkf
@@ -90,6 +93,7 @@ from systems.flow.mean_flow import MeanFlow
 from systems.flow.projector import FlowProjector
 from systems.flow.shell import ShellView
 from systems.flow.sphere_flow import SphereFlow, SphereFlowEstimator
+from systems.formation.building import Algorithm1Parameters
 from systems.image_effects import ImageEffects
 from systems.io.bag import BagWriter
 from systems.io.playback import Entry, MessagePlayback, VectorPlayback
@@ -114,6 +118,11 @@ from systems.messages import (
     Path as PlannedPath,
 )
 from systems.planners.astar import AStarPlanner
+from systems.planners.failure import Failure
+from systems.planners.formation_lattice import strip
+from systems.planners.formation_obstacles import Obstacles
+from systems.planners.formation_planner import FormationMove, FormationPlanner
+from systems.planners.formation_turns import FormationTurns
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor
 from systems.planners.waypoint_sequencer import WaypointSequencer
@@ -125,6 +134,7 @@ from systems.sensors.lidar import Lidar, LidarParameters
 from systems.sensors.missed_passages import MissedPassages
 from systems.sensors.pose_outliers import PoseOutliers
 from systems.sensors.rendered_camera import RenderedCamera
+from systems.sensors.ultrasonic import UltrasonicParameters, UltrasonicRing
 from systems.sensors.wheel_encoders import WheelEncoders
 from systems.shell.marker_pose import ShellMarkerPose, shell_localizer
 from systems.shell.markers_seen import MarkersSeen
@@ -348,6 +358,20 @@ QUERIES = (scene(0.0), scene(0.05))
 POSES = (RigidTransform(), RigidTransform(RollPitchYaw(0.1, 0.2, 0.3), [1.0, 2.0, 3.0]))
 ESTIMATES = (marker_pose(0.5), marker_pose(0.51))
 
+
+def formation_step(kind: type) -> Case:
+    """A step between the beacons 0, 1 and 2, and another one."""
+    system = kind(front_camera=CAMERA, rear_camera=CAMERA, **FORMATION_OPTIONS.get(kind, {}))
+    task = [0, 1, 2, 2.25, 0, 0, 1.5, 1.3, 0, 0.75, 0, 0, 3.0, 1.3, 0, 1.3]
+    seen = (detections(0.0), detections(0.1))
+    inputs = {"front_detections": seen, "rear_detections": seen}
+    return Case(system, {**inputs, "task": (np.array([1, *task]), np.array([2, *task]))})
+
+
+# The narrow camera of these tests holds 80 px aside.
+FORMATION_OPTIONS = {TriangleAlgorithm1: {"parameters": Algorithm1Parameters(dt=70.0)}}
+
+
 CASES: dict[type, Callable[[Path], Case]] = {
     AStarPlanner: lambda _: Case(
         AStarPlanner(),
@@ -407,8 +431,38 @@ CASES: dict[type, Callable[[Path], Case]] = {
     ),
     DwaAvoider: lambda _: avoider(DwaAvoider),
     EstimateViewer: viewer,
+    Failure: lambda _: Case(Failure(robots=4, robot=1, at=0.1), {}),
+    FormationTurns: lambda _: Case(
+        FormationTurns(start_poses=[[0.75, 0, 0], [0, 1.3, 0], [2.25, 0, 0], [1.5, 1.3, 0]]),
+        {
+            "move": (FormationMove(), FormationMove(stamp=0.0, status="moving", number=1)),
+            "poses": vector(*range(12)),
+            "failed": vector(0.0, 0.0, 0.0, 0.0),
+            **{f"status_{k}": vector(0.0, 0.0) for k in range(4)},
+        },
+    ),
+    FormationFilter: lambda _: Case(
+        FormationFilter(start_poses=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], camera=CAMERA),
+        {"moving": vector(0.0, 0.0)}
+        | {
+            f"robot{k}_{name}": (detections(0.0), detections(0.01, 3.0))
+            for k in range(2)
+            for name in ("front_camera", "rear_camera")
+        },
+        nan_outputs=("nis",),
+    ),
     FlowProjector: lambda _: Case(
         FlowProjector(camera=CAMERA), {"pose": (VIEW.X_SC, VIEW.X_SC @ POSES[1])}
+    ),
+    FormationPlanner: lambda _: Case(
+        FormationPlanner(start=strip(4, 1.5)),
+        {
+            "positions": vector(*strip(4, 1.5).ravel()),
+            "failed": vector(0.0, 0.0, 0.0, 0.0),
+            "obstacles": (Obstacles(), Obstacles(stamp=0.0)),
+            "destination": vector(9.0, 4.0),
+            "progress": vector(0.0, 0.0),
+        },
     ),
     GyroYaw: lambda _: Case(GyroYaw(num_samples=3), {"imu": vector(0.0, 0.0, 0.1, 0.0, 0.0, 9.81)}),
     Imu: lambda _: Case(
@@ -627,6 +681,8 @@ CASES: dict[type, Callable[[Path], Case]] = {
     ),
     ShellViewer: shell_viewer,
     SurroundingsViewer: surroundings_viewer,
+    TriangleAlgorithm1: lambda _: formation_step(TriangleAlgorithm1),
+    TriangleResection: lambda _: formation_step(TriangleResection),
     TwinPositions: twin_positions,
     TwinState: lambda _: Case(
         TwinState(), {"twin_pose": vector(1.0, 2.0, 0.3), "twin_velocity": vector(0.3, 0.5)}
@@ -649,6 +705,15 @@ CASES: dict[type, Callable[[Path], Case]] = {
         {"command": vector(0.3, 0.2)},
     ),
     WheelSpeeds: lambda _: Case(WheelSpeeds(ticks_per_turn=80.0), {"ticks": vector(100.0, 120.0)}),
+    UltrasonicRing: lambda _: Case(
+        UltrasonicRing(
+            parent_frame=WORLD,
+            X_PU=RigidTransform(),
+            parameters=UltrasonicParameters(dropout_probability=0.0),
+            role=Role.kPerception,  # of the markers' boards
+        ),
+        {"query_object": QUERIES},
+    ),
     WheelEncoders: lambda _: Case(WheelEncoders(), {"wheel_angles": vector(7.0, -3.0)}),
     WheelPwm: lambda _: Case(
         WheelPwm(to_duty=MotorModel(MotorParameters()).duty), {"wheel_speeds": vector(3.0, 2.0)}
@@ -842,11 +907,20 @@ def outputs(system: LeafSystem, context: Context) -> dict[str, Any]:
     return {port.get_name(): copied(port.Eval(context)) for port in ports(system)["output"]}
 
 
+def said_of(described: dict[tuple[str, str], str], output: str) -> str:
+    """What the docstring says of an output port, perhaps as one of many, such as `task_{k}`."""
+    for (kind, name), said in described.items():
+        pattern = re.sub(r"{\w+}", r"\\w+", name)
+        if kind == "output" and re.fullmatch(pattern, output):
+            return said
+    raise AssertionError(f"{output} is not described")
+
+
 @every_system
 def test_it_steps_and_sends_what_it_says(kind: type, case: Case) -> None:
     described = described_ports(kind)
     for name, value in outputs(case.system, simulate(case)).items():
-        said = described["output", name]
+        said = said_of(described, name)
         if isinstance(value, np.ndarray):
             vector = said.startswith("vector of ") or said == "of the type of `model`"
             assert vector, f"{name} is a vector, said to be {said}"

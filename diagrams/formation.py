@@ -1,0 +1,165 @@
+"""A formation: robots that are each other's landmarks cross open space in equilateral triangles.
+
+The robots of Kang, Kwon, Bae, Kim, "Monocular Vision-Based Swarm Robot Localization Using
+Equilateral Triangular Formations".
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.geometry import Meshcat
+
+from diagrams.formation_mission import FormationMission
+from diagrams.mission import Mission
+from diagrams.scenario import Scenario
+from diagrams.station import Hardware, RobotParameters, Start
+from diagrams.tables import Choice, Table
+from diagrams.world import WorldParameters
+from plants.arena import check_free
+from systems.controllers.formation_step import FormationStepParameters
+from systems.planners.formation_lattice import fit_lattice, strip
+from systems.planners.formation_moves import FormationParameters
+from systems.planners.formation_turns import FormationTurnsParameters
+from systems.validation import require, require_positive
+
+Array = NDArray[np.float64]
+
+CONTROLLERS = Table(
+    "controller",
+    {
+        "algorithm1": "systems.controllers.triangle_algorithm1:TriangleAlgorithm1",
+        "resection": "systems.controllers.triangle_resection:TriangleResection",
+    },
+    resources=frozenset({"front_camera", "rear_camera", "step"}),
+)
+ESTIMATORS = Table(
+    "estimator",
+    {"formation": "systems.estimators.formation_filter:FormationFilter"},
+    resources=frozenset({"start_poses", "camera"}),
+    optional=True,
+)
+CAMERAS = ("front_camera", "rear_camera")
+LEAST = 4  # robots
+
+
+@dataclass(kw_only=True)
+class FormationScenario(Scenario):
+    """Robots, where they stand, where they are to go.
+
+    Attributes:
+        world: obstacles; markers are on the robots.
+        robot: what all robots are like; needs the cameras `front_camera` and `rear_camera`, and a
+            body with a `ring` of markers.
+        robots: how many, robot1, robot2, ...
+        start: [[x, y], ...] where they stand at first, m; left out, a strip of triangles.
+        heading_deg: of all of them at the start.
+        destination: [x, y] m; reached when a robot stands at the vertex nearest to it.
+        formation: side of the triangles, and the room that robots need.
+        controller: drives one robot through a step: a block with the ports front_detections,
+            rear_detections, task, command, status.
+        estimator: finds where all robots are: a block with the ports moving, robot{k}_{camera},
+            poses, covariance; or `none`: every robot is believed to stand where it was to go.
+        planner: which robot moves where: `closest`, the paper's rule, or `astar`.
+        step: how a robot behaves in a step.
+        turns: how long things take.
+        fail_robot: number of the robot that fails, from 1; none if left out.
+        fail_at: when it does, s.
+    """
+
+    world: WorldParameters
+    robot: Hardware
+    robots: int = LEAST
+    start: list[list[float]] | None = None
+    heading_deg: float = 0.0
+    destination: list[float]
+    formation: FormationParameters = field(default_factory=FormationParameters)
+    controller: Annotated[Choice, CONTROLLERS]
+    estimator: Annotated[Choice | None, ESTIMATORS] = None
+    planner: Literal["closest", "astar"] = "closest"
+    step: FormationStepParameters = field(default_factory=FormationStepParameters)
+    turns: FormationTurnsParameters = field(default_factory=FormationTurnsParameters)
+    fail_robot: int | None = None
+    fail_at: float = 0.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(self.robots >= LEAST, "robots", self.robots, f"at least {LEAST}")
+        if self.start is not None:
+            require(
+                len(self.start) == self.robots,
+                "start",
+                self.start,
+                f"places of all {self.robots} robots",
+            )
+        for name in CAMERAS:
+            require(
+                name in self.robot.sensors,
+                "robot.sensors",
+                list(self.robot.sensors),
+                f"with {name}",
+            )
+        ring = getattr(self.robot.body.build(), "ring", None)
+        require(ring is not None, "robot.body.ring", ring, "markers for the others to see")
+        fails = self.fail_robot
+        require(
+            fails is None or 1 <= fails <= self.robots,
+            "fail_robot",
+            fails,
+            f"one of 1 to {self.robots}",
+        )
+        side = self.formation.side
+        require_positive(side=side)
+        fit_lattice(self.places(), side)
+        room = self.formation.robot_radius
+        for k, place in enumerate(self.places()):
+            check_free(self.world.arena, place.tolist(), room, f"start[{k}]")
+        require(
+            len(self.destination) == 2 and bool(np.isfinite(self.destination).all()),
+            "destination",
+            self.destination,
+            "[x, y] in metres",
+        )
+        check_free(self.world.arena, self.destination, room, "destination")
+
+    def places(self) -> Array:
+        """Returns where the robots stand at the start, (N, 2) m."""
+        if self.start is None:
+            return strip(self.robots, self.formation.side)
+        return np.array(self.start, float)
+
+    def start_poses(self) -> Array:
+        """Returns the poses at the start, (N, 3)."""
+        heading = math.radians(self.heading_deg)
+        return np.column_stack([self.places(), np.full(self.robots, heading)])
+
+    def names(self) -> list[str]:
+        """Returns the names of the robots."""
+        return [f"robot{k + 1}" for k in range(self.robots)]
+
+    def station_robots(self) -> dict[str, RobotParameters]:
+        """Returns the robots by name."""
+        hardware = vars(self.robot)
+        return {
+            name: RobotParameters(
+                **hardware, start=Start(x=float(x), y=float(y), heading_deg=self.heading_deg)
+            )
+            for name, (x, y) in zip(self.names(), self.places(), strict=True)
+        }
+
+    def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:
+        """Wires station, controllers, estimator and planner.
+
+        Args:
+            meshcat: where it is shown, if anywhere.
+            out: folder of the run; the recording goes there. None records nothing.
+
+        Raises:
+            ValueError: something of the scenario is refused; one line.
+        """
+        return FormationMission(self, meshcat=meshcat, out=out)

@@ -1,0 +1,156 @@
+"""The wired diagram of a formation: its outcome, its metrics, its results."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.geometry import Meshcat
+from pydrake.systems.framework import Context
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, Demultiplexer
+
+from diagrams.formation_metrics import FormationLog, formation_metrics
+from diagrams.mission import Mission, Wiring
+from diagrams.trajectories import write_tum
+from plants.formation_arena import known_obstacles
+from systems.planners.failure import Failure
+from systems.planners.formation_planner import FormationPlanner
+from systems.planners.formation_turns import FormationTurns
+
+if TYPE_CHECKING:
+    from diagrams.formation import FormationScenario
+
+Array = NDArray[np.float64]
+
+CAMERAS = ("front_camera", "rear_camera")
+
+
+class FormationMission(Mission):
+    """The wired diagram of a `FormationScenario`."""
+
+    def __init__(
+        self, scenario: FormationScenario, *, meshcat: Meshcat | None, out: Path | None
+    ) -> None:
+        """See `FormationScenario.build`."""
+        wiring = Wiring(
+            scenario, world=scenario.world, robots=scenario.station_robots(), meshcat=meshcat
+        )
+        self.station = wiring.station
+        self._scenario = scenario
+        self._wiring = wiring
+        self._names = scenario.names()
+        self._add_blocks()
+        self._connect()
+        self._has_truth = wiring.has_output(f"truth.{self._names[0]}.pose")
+        self._log()
+        self.recorder = wiring.add_recorder(out)
+        self.diagram, self.logs = wiring.build("formation")
+
+    def _add_blocks(self) -> None:
+        wiring, scenario = self._wiring, self._scenario
+        cameras = {name: scenario.robot.sensors[name].build().model() for name in CAMERAS}
+        for k in range(scenario.robots):
+            controller = scenario.controller.build(step=scenario.step, **cameras)
+            wiring.add(controller, f"controller_{k}")
+        start = scenario.start_poses()
+        wiring.add(FormationTurns(start_poses=start, parameters=scenario.turns), "turns")
+        wiring.add(
+            FormationPlanner(
+                start=start[:, :2], rule=scenario.planner, parameters=scenario.formation
+            ),
+            "planner",
+        )
+        if scenario.estimator is not None:
+            estimator = scenario.estimator.build(start_poses=start, camera=cameras[CAMERAS[0]])
+            wiring.add(estimator, "estimator")
+        fails = None if scenario.fail_robot is None else scenario.fail_robot - 1
+        wiring.add(Failure(robots=scenario.robots, robot=fails, at=scenario.fail_at), "failure")
+        wiring.add(ConstantVectorSource(scenario.destination), "destination")
+        obstacles = known_obstacles(scenario.world.arena)
+        wiring.add(ConstantValueSource(AbstractValue.Make(obstacles)), "obstacles")
+        wiring.add(Demultiplexer(scenario.robots), "looking")
+
+    def _connect(self) -> None:
+        wiring = self._wiring
+        for k, name in enumerate(self._names):
+            for camera in CAMERAS:
+                detections = f"{name}.{camera}.detections"
+                wiring.connect(detections, f"controller_{k}.{camera.split('_')[0]}_detections")
+                if wiring.has_block("estimator"):
+                    wiring.connect(detections, f"estimator.robot{k}_{camera}")
+                active = f"{name}.{camera}.active"
+                if wiring.has_input(active):
+                    wiring.connect(f"looking.y{k}", active)
+            wiring.connect(f"turns.task_{k}", f"controller_{k}.task")
+            wiring.connect(f"controller_{k}.status", f"turns.status_{k}")
+            wiring.connect(f"controller_{k}.command", f"{name}.drive.command")
+        wiring.connect("turns.looking", "looking.u0")
+        if wiring.has_block("estimator"):
+            wiring.connect("turns.moving", "estimator.moving")
+            wiring.connect("estimator.poses", "turns.poses")
+        wiring.connect("planner.move", "turns.move")
+        wiring.connect("turns.positions", "planner.positions")
+        wiring.connect("turns.progress", "planner.progress")
+        for block in ("turns", "planner"):
+            wiring.connect("failure.failed", f"{block}.failed")
+        wiring.connect("destination.y0", "planner.destination")
+        wiring.connect("obstacles.y0", "planner.obstacles")
+
+    def _log(self) -> None:
+        names = ["turns.record", "turns.positions", *(f"truth.{name}.pose" for name in self._names)]
+        for name in [*names, "estimator.poses", "estimator.covariance"]:
+            if self._wiring.has_output(name):
+                self._wiring.log(name, _LOG_RATE)
+
+    def outcome(self, context: Context) -> str | None:
+        """Returns how the planner says that the formation fares, once it is at an end."""
+        move = self._wiring.value("planner.move", context)
+        ends = ("reached", "blocked", "broken", "too_few_robots")
+        return str(move.status) if move.status in ends else None
+
+    def succeeded(self, outcome: str) -> bool:
+        """Whether the destination was reached."""
+        return outcome == "reached"
+
+    def metrics(self, context: Context) -> dict[str, Any]:
+        """Returns the metrics (see `diagrams.formation_metrics`)."""
+        return formation_metrics(self.formation_log(context), self._scenario.formation.side)
+
+    def formation_log(self, context: Context) -> FormationLog:
+        """Returns truth, belief and moves over time."""
+        t, record = self.log("turns.record", context)
+        n = self._scenario.robots
+        truth = None
+        if self._has_truth:
+            each = [self.log(f"truth.{name}.pose", context)[1] for name in self._names]
+            truth = np.stack(each, axis=1)
+        estimate = covariance = None
+        if "estimator.poses" in self.logs:
+            estimate = self.log("estimator.poses", context)[1].reshape(-1, n, 3)
+            covariance = self.log("estimator.covariance", context)[1].reshape(-1, 3 * n, 3 * n)
+        return FormationLog(
+            t=t,
+            record=record,
+            truth=truth,
+            believed=self.log("turns.positions", context)[1].reshape(-1, n, 2),
+            estimate=estimate,
+            covariance=covariance,
+        )
+
+    def write(self, context: Context, out: Path) -> None:
+        """Writes trajectories and the moves."""
+        log = self.formation_log(context)
+        for k, name in enumerate(self._names):
+            if log.truth is not None:
+                write_tum(out / f"truth_{name}.tum", log.t, log.truth[:, k])
+            if log.estimate is not None:
+                write_tum(out / f"estimate_{name}.tum", log.t, log.estimate[:, k])
+        moves = [move.to_plain() for move in log.moves()]
+        (out / "moves.json").write_text(json.dumps(moves, indent=1) + "\n")
+
+
+_LOG_RATE = 5.0  # Hz: moves take half a minute

@@ -1,0 +1,456 @@
+"""Hands a formation its moves one by one, whatever happens to its robots meanwhile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem, OutputPort, State
+
+from systems.health import Counts
+from systems.messages import Message
+from systems.planners.formation_astar import astar_move
+from systems.planners.formation_lattice import TriangleLattice, Vertex, body_of, fit_lattice
+from systems.planners.formation_moves import (
+    Forbidden,
+    Formation,
+    FormationParameters,
+    Ground,
+    Move,
+    closest_vertex_move,
+    formation_of,
+    in_reach,
+)
+from systems.planners.formation_obstacles import Obstacles, clearance
+from systems.planners.polyline import rest_of
+from systems.validation import require, require_positive
+
+Array = NDArray[np.float64]
+Rule = Callable[[Formation, Array, Ground, Forbidden], Move | None]
+
+RULES: Mapping[str, Rule] = {"closest": closest_vertex_move, "astar": astar_move}
+
+
+@dataclass(frozen=True, eq=False)
+class FormationMove(Message):
+    """What a formation is to do now.
+
+    Attributes:
+        stamp: when it was planned, s; NaN before the first plan.
+        frame_id: the frame of the places.
+        status: `waiting` (nothing is planned yet), `moving` (one robot is to move), `reached` (a
+            robot stands at the destination), `blocked` (no move leads there, for now), `broken` (a
+            beacon stands far from its vertex) or `too_few_robots` (less than four can move, or no
+            three of them make a triangle).
+        number: of the move, counted from 1; 0 before the first.
+        mover: number of the robot that is to move; -1 when none is.
+        beacons: (3,) numbers of beacons 1, 2 and 3, as `systems.formation.triangles` lists them;
+            -1 when there is no move.
+        target: (2,) the vertex to build, m; NaN when there is no move.
+        points: (n, 2) the mover's way: centre points between beacons, the last one that of beacons
+            1 and 2, then the target; m.
+        leader: the robot that bids best to lead, the beacon nearest to the destination; -1 when
+            there is none. Every robot can work the plan out; this says whose is meant to count.
+    """
+
+    stamp: float = math.nan
+    frame_id: str = ""
+    status: str = "waiting"
+    number: int = 0
+    mover: int = -1
+    beacons: NDArray[np.int64] = field(default_factory=lambda: np.full(3, -1))
+    target: Array = field(default_factory=lambda: np.full(2, math.nan))
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)))
+    leader: int = -1
+
+
+@dataclass(frozen=True, eq=False)
+class Memory(Message):
+    """What a planner keeps from one look to the next.
+
+    Attributes:
+        vertices: of the robots that stand at one, by number.
+        move: what was said last.
+        target: the vertex that the present move is to.
+        fixed: robots that cannot move, and still mark the vertex that they stand at.
+        wrecks: where other robots have failed, (2,) m each, by number; NaN where it is not known.
+        given_up: (robot, vertex) since the last move that succeeded.
+        been: sets of vertices that were taken since something else changed.
+        destination: (2,) m, and
+        obstacles: for which the last plan was made.
+    """
+
+    vertices: Mapping[int, Vertex]
+    move: FormationMove = field(default_factory=FormationMove)
+    target: Vertex | None = None
+    fixed: frozenset[int] = frozenset()
+    wrecks: Mapping[int, Array] = field(default_factory=dict)
+    given_up: frozenset[tuple[int, Vertex]] = frozenset()
+    been: frozenset[frozenset[Vertex]] = frozenset()
+    destination: Array = field(default_factory=lambda: np.full(2, math.nan))
+    obstacles: Obstacles = field(default_factory=Obstacles)
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """What a planner is told at one look.
+
+    Attributes:
+        time: s.
+        positions: (n, 2) of all robots, estimated, m; NaN where one is not known.
+        failed: (n,) 0 for a robot that is able, 1 for one that cannot move, 2 for one that is no
+            beacon either.
+        obstacles: known or sensed.
+        destination: (2,) m.
+        outcome: of the present move: 0 under way, 1 done, -1 given up.
+    """
+
+    time: float
+    positions: Array
+    failed: NDArray[np.int64]
+    obstacles: Obstacles
+    destination: Array
+    outcome: int = 0
+
+
+def after(
+    memory: Memory,
+    report: Report,
+    lattice: TriangleLattice,
+    parameters: FormationParameters,
+    rule: Rule,
+) -> Memory:
+    """Returns what a planner keeps, and says, after a look.
+
+    A move goes on until it is done or given up, the mover or one of its beacons fails, or an
+    obstacle turns up in the rest of its way. Then, and when a formation that stands is told of
+    another destination, obstacle or failure, the next move is planned.
+    """
+    vertices, wrecks, given_up = dict(memory.vertices), dict(memory.wrecks), memory.given_up
+    move = memory.move
+    under_way = move.status == "moving"
+    if under_way and memory.target is not None and report.outcome != 0:
+        under_way = False
+        if report.outcome > 0:
+            vertices[move.mover] = memory.target
+            given_up = frozenset()
+        else:
+            given_up |= {(move.mover, memory.target)}
+    # Who fails on the way marks no vertex: that is a wreck too.
+    failed = {k: int(report.failed[k]) for k in map(int, np.flatnonzero(report.failed))}
+    fixed = frozenset(k for k in failed if failed[k] == 1 and k in vertices)
+    new_wrecks = [k for k in failed if k not in fixed and k not in wrecks]
+    for k in new_wrecks:
+        place = report.positions[k]
+        if not np.isfinite(place).all():
+            place = lattice.positions(vertices[k]) if k in vertices else move.target
+        wrecks[k] = np.array(place)
+        vertices.pop(k, None)
+        under_way = under_way and k != move.mover and k not in move.beacons
+    other_obstacles = report.obstacles is not memory.obstacles
+    if under_way and other_obstacles:
+        under_way = not _is_cut(move, report, parameters)
+    kept = replace(
+        memory,
+        vertices=vertices,
+        fixed=(memory.fixed | fixed) - wrecks.keys(),
+        wrecks=wrecks,
+        given_up=given_up,
+        destination=report.destination if not under_way else memory.destination,
+        obstacles=report.obstacles,
+    )
+    changed = (
+        bool(new_wrecks)
+        or kept.fixed != memory.fixed
+        or other_obstacles
+        or report.outcome < 0
+        or not np.array_equal(report.destination, memory.destination)
+    )
+    if changed:
+        kept = replace(kept, been=frozenset())
+    broken = _is_broken(vertices, report.positions, lattice, parameters)
+    if broken and move.status != "broken":
+        return replace(kept, move=_standing(move, "broken", report.time), target=None)
+    if under_way or broken or not (changed or move.status in ("waiting", "moving")):
+        return kept
+    return _planned(kept, report, lattice, parameters, rule)
+
+
+def _is_cut(move: FormationMove, report: Report, parameters: FormationParameters) -> bool:
+    position = report.positions[move.mover]
+    if not np.isfinite(position).all():
+        return False
+    rest = np.concatenate([position[None], rest_of(move.points, position)])
+    # Planned with the whole safety zone, given up at half of it: noise must not turn robots back.
+    room = parameters.robot_radius + parameters.safety / 2
+    return any(clearance(report.obstacles, a, b) < room for a, b in pairwise(rest))
+
+
+def _is_broken(
+    vertices: Mapping[int, Vertex],
+    positions: Array,
+    lattice: TriangleLattice,
+    parameters: FormationParameters,
+) -> bool:
+    names = sorted(vertices)
+    places = lattice.positions(np.array([vertices[k] for k in names], float).reshape(-1, 2))
+    off = np.hypot(*(positions[names] - places).T)
+    return bool((off > parameters.tolerance * parameters.side).any())  # not for NaN
+
+
+def _standing(move: FormationMove, status: str, time: float, leader: int = -1) -> FormationMove:
+    return FormationMove(
+        stamp=time, frame_id=move.frame_id, status=status, number=move.number, leader=leader
+    )
+
+
+def _planned(
+    memory: Memory,
+    report: Report,
+    lattice: TriangleLattice,
+    parameters: FormationParameters,
+    rule: Rule,
+) -> Memory:
+    """Returns the memory with the next move, or with what there is to say instead."""
+    positions, destination = report.positions, report.destination
+    able = [k for k in range(len(positions)) if k not in memory.wrecks and k not in memory.fixed]
+    if len(able) < 4 or not body_of(list(memory.vertices.values())):
+        move = _standing(memory.move, "too_few_robots", report.time)
+        return replace(memory, move=move, target=None)
+    places = {
+        k: lattice.positions(memory.vertices[k]) if k in memory.vertices else positions[k]
+        for k in able
+    }
+    known = {k: p for k, p in places.items() if np.isfinite(p).all()}
+    formation = formation_of(memory.vertices, known, memory.fixed)
+    wrecks = [place for place in memory.wrecks.values() if np.isfinite(place).all()]
+    wrecks += [lattice.positions(memory.vertices[k]) for k in memory.fixed - formation.fixed]
+    apart = {
+        k: (float(np.hypot(*(lattice.positions(v) - destination)).round(9)), k)
+        for k, v in formation.standing.items()
+        if k not in memory.fixed
+    }
+    leader = min(apart, key=apart.__getitem__, default=-1)
+    if in_reach(formation, destination, Ground(lattice, report.obstacles, parameters)):
+        move = _standing(memory.move, "reached", report.time, leader)
+        return replace(memory, move=move, target=None)
+    been = memory.been | {formation.places_of_able()}
+    found = None
+    # A wreck may close the way through the triangles: then others drive around them.
+    for around in (False, True)[: 1 + bool(wrecks)]:
+        for given_up in dict.fromkeys((memory.given_up, frozenset())):
+            forbidden = Forbidden(given_up, been)
+            found = found or _first_move(
+                formation, wrecks, report, lattice, parameters, rule, forbidden, around
+            )
+    if found is None:
+        move = _standing(memory.move, "blocked", report.time, leader)
+        return replace(memory, move=move, target=None)
+    number_of = {v: k for k, v in formation.standing.items()}
+    move = FormationMove(
+        stamp=report.time,
+        frame_id=memory.move.frame_id,
+        status="moving",
+        number=memory.move.number + 1,
+        mover=found.mover,
+        beacons=np.array([number_of[v] for v in found.beacons]),
+        target=found.points[-1].copy(),
+        points=found.points,
+        leader=min((k for k in apart if k != found.mover), key=apart.__getitem__, default=-1),
+    )
+    staying = {k: v for k, v in memory.vertices.items() if k != found.mover}
+    return replace(memory, vertices=staying, been=been, move=move, target=found.target)
+
+
+def _first_move(
+    formation: Formation,
+    wrecks: list[Array],
+    report: Report,
+    lattice: TriangleLattice,
+    parameters: FormationParameters,
+    rule: Rule,
+    forbidden: Forbidden,
+    around: bool,
+) -> Move | None:
+    """Returns the move of a stray, the farthest first, or else of one of the formation.
+
+    Whoever stands beside the formation is an obstacle for all others.
+    """
+    strays = formation.strays
+    far = {k: float(np.hypot(*(p - report.destination))) for k, p in strays.items()}
+    for mover in [*sorted(far, key=lambda k: (-far[k], k)), None]:
+        in_the_way = [*wrecks, *(p for k, p in strays.items() if k != mover)]
+        circles = [[*place, parameters.robot_radius] for place in in_the_way]
+        obstacles = report.obstacles.with_circles(circles)
+        ground = Ground(lattice, obstacles, parameters, around=around)
+        alone = {} if mover is None else {mover: strays[mover]}
+        if len(formation.standing) + len(alone) < 4:
+            continue
+        here = Formation(formation.standing, alone, formation.fixed)
+        move = rule(here, report.destination, ground, forbidden)
+        if move is not None and mover in (None, move.mover):
+            return move
+    return None
+
+
+class FormationPlanner(LeafSystem):
+    """Says which robot of a formation moves next, to which vertex, by which way.
+
+    .. pydrake_system::
+
+        name: FormationPlanner
+        input_ports:
+        - positions
+        - failed
+        - obstacles
+        - destination
+        - progress
+        output_ports:
+        - move
+        - health
+
+    Args:
+        start: (n, 2) where the n >= 4 robots stand at first, m in map, at the vertices of triangles
+            that share sides. All vertices to come are on the lattice that fits them best, so what
+            a move misses its vertex by is not handed on to the next, if the estimate knows it.
+        rule: `closest`, the paper's rule, or `astar`.
+        parameters: room that robots need, and what counts as arrival.
+        rate: how often the inputs are looked at, Hz.
+
+    Ports:
+        positions (input, vector of 2n): x, y of each robot in map, the estimate, m.
+        failed (input, vector of n): 0 for a robot that is able, 1 for one that cannot move, but
+            still marks its vertex if it stands at one, 2 for one that is no beacon either. Either
+            is for good.
+        obstacles (input, Obstacles): in map, known or sensed. What is handed on without a change
+            is to be the same message. Robots that have failed, or stand beside the formation, count
+            too and need not be among them.
+        destination (input, vector of 2): x, y in map, m.
+        progress (input, vector of 2): number of a move, and what became of it: 0 it is under way, 1
+            the robot stands at its vertex, -1 it has given up. Of other moves than the present one
+            nothing is taken note of.
+        move (output, FormationMove): updated at `rate`, a new message only when there is something
+            new to say.
+        health (output, Health): looks at destinations or obstacles that could not be used, while
+            the last ones count, and at positions of robots still able that were not finite.
+
+    A robot that cannot move serves as a beacon until it is left behind; then, or when it fails on
+    the way or is no beacon either, it is an obstacle. What still hangs together is the formation,
+    and those that were parted from it come back to it as movers.
+
+    Source: [FORM] 3, see `systems.planners.formation_moves`, and for the multiple-leader-candidate
+    structure its remark that any robot can lead when another fails.
+
+    Raises:
+        ValueError: fewer than four robots, a start that is no formation, or an unknown rule.
+    """
+
+    def __init__(
+        self,
+        *,
+        start: ArrayLike,
+        rule: str = "closest",
+        parameters: FormationParameters | None = None,
+        rate: float = 10.0,
+    ) -> None:
+        super().__init__()
+        require_positive(rate=rate)
+        places = np.asarray(start, float).reshape(-1, 2)
+        require(len(places) >= 4, "start", places.tolist(), "places of at least four robots")
+        require(rule in RULES, "rule", rule, " or ".join(RULES))
+        self._parameters = parameters or FormationParameters()
+        self._rule = RULES[rule]
+        self._lattice, vertices = fit_lattice(places, self._parameters.side)
+        n = len(places)
+        self._positions_input = self.DeclareVectorInputPort("positions", 2 * n)
+        self._failed_input = self.DeclareVectorInputPort("failed", n)
+        self._obstacles_input = self.DeclareAbstractInputPort(
+            "obstacles", AbstractValue.Make(Obstacles())
+        )
+        self._destination_input = self.DeclareVectorInputPort("destination", 2)
+        self._progress_input = self.DeclareVectorInputPort("progress", 2)
+        first = Memory(dict(enumerate(vertices)), FormationMove(frame_id="map"))
+        self._memory = self.DeclareAbstractState(AbstractValue.Make(first))
+        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._look)
+        self._move_output = self.DeclareAbstractOutputPort(
+            "move",
+            lambda: AbstractValue.Make(FormationMove()),
+            lambda context, output: output.set_value(
+                context.get_abstract_state(self._memory).get_value().move
+            ),
+            {self.abstract_state_ticket(self._memory)},
+        )
+        self._counts = Counts(self, "bad_position", "bad_destination", "bad_obstacles")
+
+    def positions_input_port(self) -> InputPort:
+        """Returns the port of the estimated positions."""
+        return self._positions_input
+
+    def failed_input_port(self) -> InputPort:
+        """Returns the port that says who has failed."""
+        return self._failed_input
+
+    def obstacles_input_port(self) -> InputPort:
+        """Returns the port of the obstacles."""
+        return self._obstacles_input
+
+    def destination_input_port(self) -> InputPort:
+        """Returns the port of the destination."""
+        return self._destination_input
+
+    def progress_input_port(self) -> InputPort:
+        """Returns the port of what became of a move."""
+        return self._progress_input
+
+    def move_output_port(self) -> OutputPort:
+        """Returns the port of the moves."""
+        return self._move_output
+
+    def health_output_port(self) -> OutputPort:
+        """Returns the port of the counts."""
+        return self._counts.output_port
+
+    def _look(self, context: Context, state: State) -> EventStatus:
+        memory: Memory = context.get_abstract_state(self._memory).get_value()
+        positions = self._positions_input.Eval(context).reshape(-1, 2).copy()
+        said = np.nan_to_num(self._failed_input.Eval(context))
+        failed = np.clip(np.rint(said), 0, 2).astype(np.int64)
+        obstacles: Obstacles = self._obstacles_input.Eval(context)
+        destination = self._destination_input.Eval(context).copy()
+        number, outcome = self._progress_input.Eval(context)
+        bad_position = bool((~np.isfinite(positions).all(axis=1) & (failed == 0)).any())
+        bad_destination = not np.isfinite(destination).all()
+        bad_obstacles = not obstacles.sound
+        discrete_state: Any = state.get_mutable_discrete_state()
+        self._counts.add(
+            context,
+            discrete_state,
+            bad_position=bad_position,
+            bad_destination=bad_destination,
+            bad_obstacles=bad_obstacles,
+        )
+        if bad_obstacles:
+            obstacles = memory.obstacles
+        if bad_destination:
+            destination = memory.destination
+        if not np.isfinite(destination).all():
+            return EventStatus.Succeeded()
+        known = number == memory.move.number and np.isfinite(outcome)
+        report = Report(
+            time=context.get_time(),
+            positions=positions,
+            failed=failed,
+            obstacles=obstacles,
+            destination=destination,
+            outcome=int(np.sign(outcome)) if known else 0,
+        )
+        memory = after(memory, report, self._lattice, self._parameters, self._rule)
+        slot: Any = state.get_mutable_abstract_state(int(self._memory))
+        slot.set_value(memory)
+        return EventStatus.Succeeded()

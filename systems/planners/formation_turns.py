@@ -1,0 +1,312 @@
+"""Lets the robots of a formation move in turns: who drives, who stands, who looks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.common.value import AbstractValue
+from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+
+from systems.controllers.formation_step import OFF, TASK_SIZE, Status, StepTask
+from systems.formation.triangles import arrival_heading
+from systems.health import Counts
+from systems.planners.formation_planner import FormationMove
+from systems.validation import require, require_non_negative, require_positive
+
+Array = NDArray[np.float64]
+
+
+class Phase(IntEnum):
+    """What the formation is at."""
+
+    LOOK = 0  # all stand and look at each other
+    READY = 1  # waiting for the next move
+    START = 2  # a robot is about to set out
+    DRIVE = 3
+    STOP = 4  # it has stopped, or is about to
+
+
+@dataclass
+class FormationTurnsParameters:
+    """How long things take.
+
+    Attributes:
+        start_time: from the announcement of a move to its task, s.
+        stop_time: from the end of a task until the robot stands for sure, s.
+        look_time: for which all look at each other then, s.
+        patience: of one move; it is given up after it, s.
+    """
+
+    start_time: float = 0.2
+    stop_time: float = 0.5
+    look_time: float = 1.0
+    patience: float = 120.0
+
+    def __post_init__(self) -> None:
+        require_non_negative(
+            start_time=self.start_time, stop_time=self.stop_time, look_time=self.look_time
+        )
+        require_positive(patience=self.patience)
+
+
+class FormationTurns(LeafSystem):
+    """Hands each move to its robot as a task, says who moves, and reports what became of it.
+
+    .. pydrake_system::
+
+        name: FormationTurns
+        input_ports:
+        - move
+        - poses
+        - failed
+        - status_{k}
+        output_ports:
+        - task_{k}
+        - moving
+        - looking
+        - progress
+        - positions
+        - record
+        - health
+
+    Args:
+        start_poses: (N, 3) [x (m), y (m), theta (rad)] of the robots in map at the start.
+        parameters: how long things take.
+        rate: Hz.
+
+    Ports:
+        move (input, FormationMove): of the planner.
+        poses (input, vector of 3 N): [x, y, theta] of each robot in map, the estimate; unconnected,
+            every robot is believed to stand exactly where its last move was to end, with the anchor
+            behind it: that is how the paper's errors add up.
+        failed (input, vector of N): other than 0 for robots that cannot drive; unconnected: none.
+        status_{k} (input, vector of 2): of robot k's controller, k from 0.
+        task_{k} (output, vector of 17): its `StepTask`.
+        moving (output, vector of N): 1 for the robot that moves, from before it sets out until it
+            stands again.
+        looking (output, vector of N): 1 for each robot whose cameras are needed: the mover's while
+            it moves, everybody's while all stand and look.
+        progress (output, vector of 2): number of the move, and 1 when it is done, -1 when it was
+            given up (its controller waits for too long, or the robot has failed), else 0.
+        positions (output, vector of 2 N): x, y of the robots as they are believed to be.
+        record (output, vector of 8): number of the last move that ended, its robot, its three
+            beacons, its target (2, m) and what became of it (1 or -1); zeros before the first.
+        health (output, Health): `bad_pose`, looks at estimates that were not finite, for which
+            those before count; `given_up`, moves.
+
+    Raises:
+        ValueError: fewer than four robots, poses that are not finite, or a rate out of range.
+    """
+
+    def __init__(
+        self,
+        *,
+        start_poses: ArrayLike,
+        parameters: FormationTurnsParameters | None = None,
+        rate: float = 10.0,
+    ) -> None:
+        super().__init__()
+        require_positive(rate=rate)
+        poses = np.array(start_poses, float).reshape(-1, 3)
+        require(len(poses) >= 4, "start_poses", poses.tolist(), "poses of at least four robots")
+        require(bool(np.isfinite(poses).all()), "start_poses", poses.tolist(), "finite")
+        n = self._robots = len(poses)
+        self._parameters = parameters or FormationTurnsParameters()
+        self._move_input = self.DeclareAbstractInputPort(
+            "move", AbstractValue.Make(FormationMove())
+        )
+        self._poses_input = self.DeclareVectorInputPort("poses", 3 * n)
+        self._failed_input = self.DeclareVectorInputPort("failed", n)
+        self._status_inputs = [self.DeclareVectorInputPort(f"status_{k}", 2) for k in range(n)]
+        self._belief = self.DeclareDiscreteState(poses.ravel())
+        # Phase, since when (s), number of the move, its robot, what became of it.
+        self._turn = self.DeclareDiscreteState([Phase.LOOK, 0.0, 0.0, -1.0, 0.0])
+        self._task = self.DeclareDiscreteState(OFF.vector())
+        self._record = self.DeclareDiscreteState(8)
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._update)
+        turn = {self.discrete_state_ticket(self._turn)}
+        both = turn | {self.discrete_state_ticket(self._task)}
+        self._task_outputs = [
+            self.DeclareVectorOutputPort(
+                f"task_{k}",
+                TASK_SIZE,
+                lambda context, output, k=k: output.SetFromVector(self._task_of(context, k)),
+                both,
+            )
+            for k in range(n)
+        ]
+        self._moving_output = self.DeclareVectorOutputPort(
+            "moving",
+            n,
+            lambda context, output: output.SetFromVector(self._moving(context)),
+            turn,
+        )
+        self._looking_output = self.DeclareVectorOutputPort(
+            "looking",
+            n,
+            lambda context, output: output.SetFromVector(self._looking(context)),
+            turn,
+        )
+        self._progress_output = self.DeclareVectorOutputPort(
+            "progress", 2, self._calc_progress, turn
+        )
+        self._positions_output = self.DeclareVectorOutputPort(
+            "positions",
+            2 * n,
+            lambda context, output: output.SetFromVector(
+                context.get_discrete_state(self._belief).get_value().reshape(n, 3)[:, :2].ravel()
+            ),
+            {self.discrete_state_ticket(self._belief)},
+        )
+        self._record_output = self.DeclareStateOutputPort("record", self._record)
+        self._counts = Counts(self, "bad_pose", "given_up")
+
+    def move_input_port(self) -> InputPort:
+        """Returns the port of the planner's moves."""
+        return self._move_input
+
+    def poses_input_port(self) -> InputPort:
+        """Returns the port of the estimated poses."""
+        return self._poses_input
+
+    def failed_input_port(self) -> InputPort:
+        """Returns the port of who has failed."""
+        return self._failed_input
+
+    def status_input_port(self, robot: int) -> InputPort:
+        """Returns the port of a controller's status."""
+        return self._status_inputs[robot]
+
+    def task_output_port(self, robot: int) -> OutputPort:
+        """Returns the port of a robot's task."""
+        return self._task_outputs[robot]
+
+    def moving_output_port(self) -> OutputPort:
+        """Returns the port of who moves."""
+        return self._moving_output
+
+    def looking_output_port(self) -> OutputPort:
+        """Returns the port of whose cameras are needed."""
+        return self._looking_output
+
+    def progress_output_port(self) -> OutputPort:
+        """Returns the port of what became of the present move."""
+        return self._progress_output
+
+    def positions_output_port(self) -> OutputPort:
+        """Returns the port of the believed positions."""
+        return self._positions_output
+
+    def record_output_port(self) -> OutputPort:
+        """Returns the port of the last move that ended."""
+        return self._record_output
+
+    def health_output_port(self) -> OutputPort:
+        """Returns the port of the counts."""
+        return self._counts.output_port
+
+    # --- Outputs ---
+
+    def _now(self, context: Context) -> tuple[Phase, int]:
+        """Returns the phase and the robot of the present move, -1 for none."""
+        phase, _, _, mover, _ = context.get_discrete_state(self._turn).get_value()
+        return Phase(int(phase)), int(mover)
+
+    def _task_of(self, context: Context, robot: int) -> Array:
+        phase, mover = self._now(context)
+        if phase == Phase.DRIVE and robot == mover:
+            task: Array = context.get_discrete_state(self._task).get_value()
+            return task
+        return OFF.vector()
+
+    def _moving(self, context: Context) -> Array:
+        phase, mover = self._now(context)
+        moving = np.zeros(self._robots)
+        if phase in (Phase.START, Phase.DRIVE, Phase.STOP):
+            moving[mover] = 1.0
+        return moving
+
+    def _looking(self, context: Context) -> Array:
+        phase, _ = self._now(context)
+        return np.ones(self._robots) if phase == Phase.LOOK else self._moving(context)
+
+    def _calc_progress(self, context: Context, output: Any) -> None:
+        phase, _, number, _, outcome = context.get_discrete_state(self._turn).get_value()
+        output.SetFromVector([number, outcome if phase == Phase.READY else 0.0])
+
+    # --- One look ---
+
+    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+        p, t = self._parameters, context.get_time()
+        phase, since, number, mover, outcome = context.get_discrete_state(self._turn).get_value()
+        waited = t - since + 1e-9
+        poses = self._believed(context, discrete_state)
+        move: FormationMove = self._move_input.Eval(context)
+        after: Phase | None = None
+        if phase == Phase.LOOK and waited >= p.look_time:
+            after = Phase.READY
+        elif phase == Phase.READY:
+            if move.status == "moving" and move.number > number and move.mover >= 0:
+                number, mover, outcome, after = move.number, move.mover, 0.0, Phase.START
+        elif phase == Phase.START and waited >= p.start_time:
+            robot = int(mover)
+            task = StepTask(
+                int(number), move.beacons, poses[move.beacons], move.target, poses[robot, :2]
+            )
+            discrete_state.set_value(self._task, task.vector())
+            after = Phase.DRIVE
+        elif phase == Phase.DRIVE:
+            outcome = self._outcome(context, int(mover), number, waited)
+            if outcome:
+                after = Phase.STOP
+        elif phase == Phase.STOP and waited >= p.stop_time:
+            self._end(context, discrete_state, poses, int(mover), outcome)
+            after = Phase.LOOK
+        if after is not None:
+            discrete_state.set_value(self._turn, [after, t, number, mover, outcome])
+
+    def _believed(self, context: Context, discrete_state: DiscreteValues) -> Array:
+        """Returns the poses (N, 3) as they are believed to be, and remembers them."""
+        poses = context.get_discrete_state(self._belief).get_value().reshape(-1, 3)
+        if not self._poses_input.HasValue(context):
+            return poses
+        told = self._poses_input.Eval(context).reshape(-1, 3)
+        if not np.isfinite(told).all():
+            self._counts.add(context, discrete_state, bad_pose=1)
+            return poses
+        discrete_state.set_value(self._belief, told.ravel())
+        return np.asarray(told)
+
+    def _outcome(self, context: Context, mover: int, number: float, waited: float) -> float:
+        """Returns 1 when the present task is done, -1 when it is given up, else 0."""
+        done = self._status_inputs[mover].Eval(context)
+        if done[0] == number and done[1] == Status.DONE:
+            return 1.0
+        failed = self._failed_input.HasValue(context) and self._failed_input.Eval(context)[mover]
+        return -1.0 if failed or waited >= self._parameters.patience else 0.0
+
+    def _end(
+        self,
+        context: Context,
+        discrete_state: DiscreteValues,
+        poses: Array,
+        mover: int,
+        outcome: float,
+    ) -> None:
+        """Notes a move that has ended."""
+        task = StepTask.from_vector(context.get_discrete_state(self._task).get_value())
+        assert task is not None
+        record = [task.number, mover, *task.beacons, *task.target, outcome]
+        discrete_state.set_value(self._record, record)
+        if outcome < 0:
+            self._counts.add(context, discrete_state, given_up=1)
+        elif not self._poses_input.HasValue(context):
+            heading = arrival_heading(task.target, poses[task.beacons[2], :2])
+            moved = poses.copy()
+            moved[mover] = [*task.target, math.remainder(float(heading), 2 * math.pi)]
+            discrete_state.set_value(self._belief, moved.ravel())

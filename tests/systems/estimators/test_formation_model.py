@@ -1,0 +1,131 @@
+"""Bearings and distances of markers on robots: known answers, other implementations, noise."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from pydrake.autodiffutils import InitializeAutoDiff
+from pydrake.math import atan2, cos, log, sin, sqrt
+
+from systems.estimators.formation_model import (
+    Layout,
+    Sightings,
+    jacobian,
+    measure,
+    predict,
+    residuals,
+    variances,
+)
+from tests.formation_world import CAMERA, FRONT_AND_REAR, OFFSET, SIZE, FormationWorld
+
+LAYOUT = Layout(4, FRONT_AND_REAR, OFFSET)
+SOME = Sightings(
+    np.array([0, 3, 2, 1, 3]),
+    np.array([0, 1, 1, 0, 0]),
+    np.array([4, 1, 14, 11, 8]),
+    np.zeros((5, 2)),
+)
+
+
+def some_state() -> np.ndarray:
+    random = np.random.default_rng(3)
+    poses = random.uniform(-2, 2, (4, 3))
+    return np.concatenate([poses.ravel(), random.normal(0, 0.05, 8)])
+
+
+def test_known_sightings() -> None:
+    """Robot 0 in the origin looks east; robot 1, 2 m ahead and 2 m to the left, shows its right."""
+    x = np.zeros(LAYOUT.size)
+    x[3:6] = 2.0, 2.15, 0.0
+    seen = Sightings(np.array([0, 0]), np.array([0, 1]), np.array([7, 7]), np.zeros((2, 2)))
+    expected = [math.pi / 4, math.log(math.sqrt(8))], [-3 * math.pi / 4, math.log(math.sqrt(8))]
+    np.testing.assert_allclose(predict(LAYOUT, x, seen), expected, atol=1e-12)
+    x[LAYOUT.poses] = 0.1  # the front camera of robot 0 looks more to the left than it is said to
+    np.testing.assert_allclose(predict(LAYOUT, x, seen)[0, 0], math.pi / 4 - 0.1, atol=1e-12)
+
+
+def test_jacobian_is_that_of_autodiff() -> None:
+    x = some_state()
+    states = InitializeAutoDiff(x).ravel()
+    J = jacobian(LAYOUT, x, SOME)
+    for n, (i, c, marker) in enumerate(zip(SOME.observer, SOME.camera, SOME.marker, strict=True)):
+        j, side = divmod(int(marker), 4)
+        px, py, theta = states[3 * i : 3 * i + 3]
+        qx, qy, other = states[3 * j : 3 * j + 3]
+        angle = other + side * math.pi / 2
+        dx, dy = qx + OFFSET * cos(angle) - px, qy + OFFSET * sin(angle) - py
+        bearing = atan2(dy, dx) - theta - c * math.pi - states[12 + 2 * i + c]
+        distance = log(sqrt(dx * dx + dy * dy))
+        np.testing.assert_allclose(J[n, 0], bearing.derivatives(), atol=1e-12)
+        np.testing.assert_allclose(J[n, 1], distance.derivatives(), atol=1e-12)
+        value = predict(LAYOUT, x, SOME)[n]
+        assert math.remainder(value[0] - bearing.value(), 2 * math.pi) == pytest.approx(
+            0, abs=1e-12
+        )
+        assert value[1] == pytest.approx(distance.value(), abs=1e-12)
+
+
+def test_residuals_do_not_jump_at_half_a_turn() -> None:
+    x = some_state()
+    values = predict(LAYOUT, x, SOME) + np.array([2 * math.pi - 0.01, 0.02])
+    r = residuals(LAYOUT, x, SOME._replace(values=values))
+    np.testing.assert_allclose(r, np.tile([-0.01, 0.02], (5, 1)), atol=1e-12)
+
+
+def test_corners_without_noise_give_what_the_model_predicts() -> None:
+    """Through the pinhole, at all angles, with yaw errors: two ways that share no line."""
+    total = 0
+    for seed in range(5):
+        world = FormationWorld(seed=seed, start_noise=(0.2, 0.3), yaw_error=0.02)
+        x = np.concatenate([world.poses.ravel(), world.yaw_errors.ravel()])
+        for i in range(4):
+            for c in range(2):
+                found = world.detections(i, c, 0.0)
+                n = len(found)
+                values = measure(found, CAMERA, SIZE)
+                seen = Sightings(np.full(n, i), np.full(n, c), found.ids, values)
+                np.testing.assert_allclose(residuals(LAYOUT, x, seen), 0.0, atol=1e-9)
+                total += n
+    assert total > 20
+
+
+def test_corner_noise_gives_the_variances_that_are_promised() -> None:
+    world = FormationWorld(corner_noise=0.5, yaw_error=0.0, start_noise=(1e-9, 1e-9))
+    exact = FormationWorld(yaw_error=0.0, start_noise=(1e-9, 1e-9))
+    true = measure(exact.detections(3, 1, 0.0), CAMERA, SIZE)
+    errors = np.array(
+        [measure(world.detections(3, 1, 0.0), CAMERA, SIZE) - true for _ in range(2000)]
+    )
+    said = variances(
+        true, np.ones(len(true)), focal_length=485.0, marker_size=SIZE, noise=np.array([0.5, 0, 0])
+    )
+    assert len(true) >= 3
+    ratio = errors.var(axis=0) / said
+    # By hand, of a marker of width w and height h: (1 + (w / h)^2) / 1.5 in the bearing.
+    corners = exact.detections(3, 1, 0.0).corners
+    width, height = np.ptp(corners[..., 0], axis=1), np.ptp(corners[..., 1], axis=1)
+    np.testing.assert_allclose(ratio[:, 0], (1 + (width / height) ** 2) / 1.5, rtol=0.12)
+    np.testing.assert_allclose(ratio[:, 1], 1.0, atol=0.1)
+    np.testing.assert_allclose(errors.mean(axis=0), 0.0, atol=2e-3)
+
+
+def test_means_over_pictures_lose_the_white_noise_only() -> None:
+    values = np.array([[0.1, math.log(1.5)]])
+    terms = {"focal_length": 485.0, "marker_size": SIZE, "noise": np.array([0.5, 0.001, 0.003])}
+    one, many = (variances(values, np.array([float(n)]), **terms)[0] for n in (1, 100))
+    floor = np.square([0.001, 0.003])
+    np.testing.assert_allclose((one - floor) / (many - floor), 100.0)
+
+
+def test_corners_that_make_no_upright_marker_are_not_measured() -> None:
+    world = FormationWorld(start_noise=(1e-9, 1e-9))
+    found = world.detections(3, 1, 0.0)
+    corners = found.corners.copy()
+    corners[0] = corners[0, ::-1]  # upside down
+    corners[1] = 100.0  # all in one point
+    corners[2, 0, 0] = math.nan
+    spoilt = type(found)(stamp=0.0, ids=found.ids, corners=corners)
+    assert np.isnan(measure(spoilt, CAMERA, SIZE)[:3]).all()
+    assert measure(type(found)(), CAMERA, SIZE).shape == (0, 2)
