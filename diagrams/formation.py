@@ -115,7 +115,10 @@ class FormationScenario(Scenario):
         )
         side = self.formation.side
         require_positive(side=side)
-        fit_lattice(self.places(), side)
+        try:
+            fit_lattice(self.places(), side)
+        except ValueError as error:
+            raise ValueError(str(error).replace("positions", "start", 1)) from error
         room = self.formation.robot_radius
         for k, place in enumerate(self.places()):
             check_free(self.world.arena, place.tolist(), room, f"start[{k}]")

@@ -1,0 +1,176 @@
+"""Who moves when: the announcements, the tasks and the reports of one move after the other."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
+
+from systems.controllers.formation_step import Status, StepTask
+from systems.planners.formation_lattice import strip
+from systems.planners.formation_planner import FormationMove
+from systems.planners.formation_turns import FormationTurns, FormationTurnsParameters
+
+Array = NDArray[np.float64]
+
+START = np.column_stack([strip(4, 1.5), np.zeros(4)])
+TARGET = np.array([3.0, 1.299])
+MOVE = FormationMove(
+    stamp=0.0, status="moving", number=1, mover=1, beacons=np.array([2, 3, 0]), target=TARGET
+)
+TIMES = FormationTurnsParameters(start_time=0.2, stop_time=0.5, look_time=1.0, patience=5.0)
+
+
+class Rig:
+    """The block with its inputs in hand; time goes on by tenths of a second."""
+
+    def __init__(self, *, estimate: bool = False) -> None:
+        self.block = FormationTurns(start_poses=START, parameters=TIMES)
+        self.simulator = Simulator(self.block)
+        self.context = self.simulator.get_mutable_context()
+        self.block.move_input_port().FixValue(self.context, FormationMove())
+        for k in range(4):
+            self.status(k, 0, Status.IDLE)
+        if estimate:
+            self.block.poses_input_port().FixValue(self.context, START.ravel())
+        self.k = 0
+
+    def status(self, robot: int, number: int, status: Status) -> None:
+        self.block.status_input_port(robot).FixValue(self.context, [number, status])
+
+    def move(self, move: FormationMove) -> None:
+        self.block.move_input_port().FixValue(self.context, move)
+
+    def wait(self, duration: float) -> None:
+        self.k += round(10 * duration)
+        self.simulator.AdvanceTo(self.k / 10 + 0.05)
+
+    def output(self, name: str) -> Any:
+        return self.block.GetOutputPort(name).Eval(self.context).copy()
+
+    def task(self, robot: int) -> StepTask:
+        task = StepTask.from_vector(self.output(f"task_{robot}"))
+        assert task is not None
+        return task
+
+
+def test_first_all_look_and_nobody_moves() -> None:
+    rig = Rig()
+    rig.move(MOVE)
+    rig.wait(0.9)
+    np.testing.assert_array_equal(rig.output("looking"), [1, 1, 1, 1])
+    np.testing.assert_array_equal(rig.output("moving"), [0, 0, 0, 0])
+    assert all(rig.task(k).number == 0 for k in range(4))
+
+
+def test_a_move_is_announced_before_its_robot_gets_the_task() -> None:
+    rig = Rig()
+    rig.move(MOVE)
+    seen = []
+    for _ in range(16):
+        rig.wait(0.1)
+        seen.append((rig.output("moving")[1], rig.task(1).number))
+    announced = next(k for k, (moving, _) in enumerate(seen) if moving)
+    driven = next(k for k, (_, number) in enumerate(seen) if number)
+    assert driven - announced == 2
+    np.testing.assert_array_equal(rig.output("looking"), [0, 1, 0, 0])
+
+
+def driving(rig: Rig) -> Rig:
+    rig.move(MOVE)
+    rig.wait(2.0)
+    return rig
+
+
+def test_the_task_says_who_stands_where() -> None:
+    task = driving(Rig()).task(1)
+    assert task.number == 1
+    np.testing.assert_array_equal(task.beacons, [2, 3, 0])
+    np.testing.assert_allclose(task.poses, START[[2, 3, 0]])
+    np.testing.assert_allclose(task.target, TARGET)
+    np.testing.assert_allclose(task.start, START[1, :2])
+
+
+def test_a_move_that_is_done_is_reported_after_all_have_looked() -> None:
+    rig = driving(Rig())
+    rig.status(1, 1, Status.DONE)
+    rig.wait(0.3)
+    assert rig.output("moving")[1] == 1  # until it stands for sure
+    rig.wait(0.6)
+    np.testing.assert_array_equal(rig.output("looking"), [1, 1, 1, 1])
+    np.testing.assert_array_equal(rig.output("moving"), [0, 0, 0, 0])
+    np.testing.assert_array_equal(rig.output("progress"), [1, 0])
+    rig.wait(1.0)
+    np.testing.assert_array_equal(rig.output("progress"), [1, 1])
+    np.testing.assert_allclose(rig.output("record"), [1, 1, 2, 3, 0, *TARGET, 1])
+
+
+def test_without_an_estimate_the_robot_is_believed_to_be_where_it_was_to_go() -> None:
+    rig = driving(Rig())
+    rig.status(1, 1, Status.DONE)
+    rig.wait(2.0)
+    expected = START[:, :2].copy()
+    expected[1] = TARGET
+    np.testing.assert_allclose(rig.output("positions").reshape(4, 2), expected)
+
+
+def test_with_one_it_is_believed() -> None:
+    rig = driving(Rig(estimate=True))
+    told = START + 0.01
+    rig.block.poses_input_port().FixValue(rig.context, told.ravel())
+    rig.status(1, 1, Status.DONE)
+    rig.wait(2.0)
+    np.testing.assert_allclose(rig.output("positions").reshape(4, 2), told[:, :2])
+
+
+def test_an_estimate_that_is_not_finite_is_dropped_and_counted() -> None:
+    rig = Rig(estimate=True)
+    rig.wait(0.2)
+    rig.block.poses_input_port().FixValue(rig.context, np.full(12, math.nan))
+    rig.wait(0.5)
+    np.testing.assert_allclose(rig.output("positions").reshape(4, 2), START[:, :2])
+    counts = rig.block.health_output_port().Eval(rig.context).counts
+    assert counts["bad_pose"] == 5
+
+
+def test_a_robot_that_waits_too_long_gives_up() -> None:
+    rig = driving(Rig())
+    rig.status(1, 1, Status.WAITING)
+    rig.wait(8.0)
+    np.testing.assert_array_equal(rig.output("progress"), [1, -1])
+    np.testing.assert_allclose(rig.output("positions").reshape(4, 2), START[:, :2])
+    assert rig.block.health_output_port().Eval(rig.context).counts["given_up"] == 1
+
+
+def test_a_robot_that_fails_on_the_way_gives_up_at_once() -> None:
+    rig = driving(Rig())
+    rig.block.failed_input_port().FixValue(rig.context, [0, 1, 0, 0])
+    rig.wait(2.0)
+    np.testing.assert_array_equal(rig.output("progress"), [1, -1])
+
+
+def test_what_a_controller_says_of_an_earlier_task_does_not_count() -> None:
+    rig = driving(Rig())
+    rig.status(1, 0, Status.DONE)
+    rig.wait(1.0)
+    np.testing.assert_array_equal(rig.output("moving"), [0, 1, 0, 0])
+
+
+def test_a_move_that_was_made_already_is_not_made_again() -> None:
+    rig = driving(Rig())
+    rig.status(1, 1, Status.DONE)
+    rig.wait(5.0)
+    np.testing.assert_array_equal(rig.output("moving"), [0, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [(START[:3], "start_poses is .*four robots"), (START * math.nan, "start_poses is .*finite")],
+)
+def test_a_start_that_is_none_is_refused(poses: Array, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        FormationTurns(start_poses=poses)
