@@ -7,6 +7,8 @@ from tests.benchmarks import (
     bench_drawing,
     bench_filter,
     bench_flow,
+    bench_formation_filter,
+    bench_formation_models,
     bench_lidar,
     bench_madgwick,
     bench_planner,
@@ -14,6 +16,7 @@ from tests.benchmarks import (
     bench_run,
     bench_shell_ekf,
     bench_snailbot,
+    bench_triangle,
 )
 from tests.benchmarks.table import show
 
@@ -27,6 +30,9 @@ for title, module in (
     ("Flow over the shell", bench_flow),
     ("Attitude filter", bench_madgwick),
     ("Filter of the pose on the shell", bench_shell_ekf),
+    ("Building a triangle", bench_triangle),
+    ("Estimator of a formation", bench_formation_filter),
+    ("Models of a formation's errors", bench_formation_models),
     ("Navigation robot", bench_run),
     ("SnailBot", bench_snailbot),
 ):
