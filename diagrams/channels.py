@@ -255,6 +255,19 @@ def shell_estimate_signal(robot: str, rate: float) -> Signal:
     )
 
 
+def chain_signal(rate: float) -> Signal:
+    """Returns the signal of the last robot's pose on the first shell, composed along a chain."""
+    return Signal(
+        port="chain.estimate",
+        topic="/chain/estimate",
+        encode="geometry_msgs/msg/PoseWithCovarianceStamped",
+        decode=None,
+        model=PoseEstimate(),
+        rate=rate,
+        played=False,
+    )
+
+
 def number_signal(port: str, rate: float) -> Signal:
     """Returns the signal of a single number that is written down only."""
     return Signal(

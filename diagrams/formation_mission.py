@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, Demultiplexer
 
 from diagrams.formation_metrics import FormationLog, formation_metrics
+from diagrams.formation_summary import plot_formation
 from diagrams.mission import Mission, Wiring
 from diagrams.trajectories import write_tum
 from plants.formation_arena import known_obstacles
@@ -142,7 +143,7 @@ class FormationMission(Mission):
         )
 
     def write(self, context: Context, out: Path) -> None:
-        """Writes trajectories and the moves."""
+        """Writes `summary.png`, trajectories and the moves."""
         log = self.formation_log(context)
         for k, name in enumerate(self._names):
             if log.truth is not None:
@@ -150,6 +151,14 @@ class FormationMission(Mission):
             if log.estimate is not None:
                 write_tum(out / f"estimate_{name}.tum", log.t, log.estimate[:, k])
         moves = [move.to_plain() for move in log.moves()]
+        if log.truth is not None:
+            plot_formation(
+                out / "summary.png",
+                log,
+                arena=self._scenario.world.arena,
+                destination=self._scenario.destination,
+                side=self._scenario.formation.side,
+            )
         (out / "moves.json").write_text(json.dumps(moves, indent=1) + "\n")
 
 

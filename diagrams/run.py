@@ -24,18 +24,20 @@ from systems.validation import require_non_negative
 RESULTS = (
     "report.json",
     "summary.png",
-    "summary_robot_*.png",
+    "summary_robot*.png",
     "replay.html",
     "scenario.yaml",
     "estimate.tum",
-    "estimate_robot_*.tum",
+    "estimate_robot*.tum",
     "truth.tum",
-    "truth_robot_*.tum",
+    "truth_robot*.tum",
     "table1.json",
     "table1.png",
-    "table1_robot_*.json",
-    "table1_robot_*.png",
+    "table1_robot*.json",
+    "table1_robot*.png",
     "calibration.json",
+    "estimate_chain.tum",
+    "moves.json",
 )
 
 _MAX_STEP = 0.01  # s, of the integrator; only kinematic twins have continuous state

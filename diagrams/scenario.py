@@ -65,7 +65,7 @@ class Scenario:
         name: of the scenario; its file's, unless given.
         description: one line for `tagtrail list`.
         seed: of all noise.
-        duration: the run ends by then, s.
+        duration: the run ends by then, s; of missions that go round, for each time.
         time_step: of the multibody plant, s.
         dynamics: `multibody` (wheels, contact, slip) or `kinematic` (the robots' kinematic twins).
         sight: what the cameras' detections come from: `rendered` pictures, pictures `drawn` without

@@ -98,7 +98,7 @@ def calibration(robot: ShellRobot, station: Station, context: Context) -> Calibr
         true = camera.true_mounting(robot.body, station.seed)
         turn = true.rotation().matrix() @ planned.rotation().matrix().T
         found.truth["mounting_deg"] = np.degrees(rotation_vector(turn)).tolist()
-        lower = true.translation()[2] - planned.translation()[2]
-        found.truth["flow_scale"] = [float(camera.height / (camera.height + lower) - 1)]
+        higher = true.translation()[2] - planned.translation()[2]
+        found.truth["flow_scale"] = [float(camera.height / (camera.height + higher) - 1)]
         found.truth["delay_ms"] = [1e3 * camera.clock_error]
     return found

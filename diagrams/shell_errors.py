@@ -11,6 +11,7 @@ from systems.validation import require, require_non_negative
 
 # A deviation of what lies evenly within +-1.
 _EVENLY = 1 / math.sqrt(3)
+_LATEST = 0.2  # s; the filter remembers little more
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class ShellErrors:
         gyro_bias_deg_s: of the gyro, each axis, deg/s.
         rock_deg: of the body on its springs against the shell's normal.
         missed_passages: part of the passages over a marker in which it is not found at all.
-        delay: by how much pictures are stamped late on the IMU's clock, s.
+        delay: by how much pictures are stamped late on the IMU's clock, s; the same for every seed.
         outliers: part of the marker poses that are wrong.
         outlier_deg: by how much those are turned about the shell's centre.
     """
@@ -44,6 +45,7 @@ class ShellErrors:
         require_non_negative(**vars(self))
         for name in ("missed_passages", "outliers"):
             require(getattr(self, name) <= 1, name, getattr(self, name), "0 to 1")
+        require(self.delay <= _LATEST, "delay", self.delay, f"at most {_LATEST:g} s")
         require(self.flow_scale < 0.5, "flow_scale", self.flow_scale, "less than 0.5")
 
     @property
@@ -59,6 +61,7 @@ class ShellErrors:
             "scale_std": self.flow_scale * _EVENLY,
             "gyro_bias_std": math.radians(self.gyro_bias_deg_s) * _EVENLY,
             "rock_std": math.radians(self.rock_deg) * _EVENLY,
+            "delay_std": self.delay,  # not drawn: it is the bound
         }
 
 

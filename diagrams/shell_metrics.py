@@ -51,8 +51,8 @@ class ShellLog:
         covariance: (n, 6, 6) of the estimate, rotation first, a rotation vector in R (rad, m).
         iteration: (n,) which iteration of the routine; what comes after the last one (such as the
             turn back) belongs to it.
-        visible: (n,) whether the latest picture gave a marker's pose.
-        markers_met: (n,) number of different markers whose poses the estimator had been given.
+        visible: (n,) whether the latest picture showed a marker of the map.
+        markers_met: (n,) number of different markers that pictures have shown.
     """
 
     t: Array

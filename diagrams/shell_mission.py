@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 
+from diagrams.channels import chain_signal
+from diagrams.metrics import nis_mean
 from diagrams.mission import Mission, Wiring
 from diagrams.shell_calibration import calibration
 from diagrams.shell_metrics import ShellLog, shell_metrics
@@ -88,6 +90,7 @@ class ShellMission(Mission):
         wiring.connect("chain.pose", "chain_vector.pose")
         wiring.log("chain_vector.vector")
         wiring.log("chain.covariance")
+        wiring.record("chain.estimate", chain_signal(rate=50.0))
 
     def outcome(self, context: Context) -> str | None:
         """Returns `detached` when a robot has lost its hold, `reached` when all drove their way.
@@ -123,6 +126,8 @@ class ShellMission(Mission):
             values = dict(shell_metrics(log)) if log is not None else {}
             values["marker_visible_fraction"] = float(robot.value("seen.seen", context)[2])
             values["min_adhesion_margin"] = self._least_margin(context, robot)
+            nis = f"{robot.block('estimator')}.nis"
+            values["nis_mean"] = nis_mean(self.log(nis, context)[1]) if nis in self.logs else None
             values |= calibration(robot, self.station, context).metrics()
             found |= {f"{prefix}{name}": value for name, value in values.items()}
         chain = self.chain_log(context)
@@ -230,12 +235,16 @@ class ShellMission(Mission):
                 markers=self.station.marker_map,
                 radius=self._scenario.world.shell.radius,
             )
+        if "chain_vector.vector" in self.logs:
+            write_poses(out / "estimate_chain.tum", *self.log("chain_vector.vector", context))
         (out / "calibration.json").write_text(json.dumps(learned, indent=1) + "\n")
 
     def _camera_views(self, robot: ShellRobot, log: ShellLog) -> list[Any]:
         world = self._scenario.world
-        host = self.station.shells[robot.body.on]
-        shell = DrawnShell(host.frame_id, world.shell.radius, host.markers, parameters=world.looks)
+        host = self.station.shells.get(robot.body.on)  # of a recording only the reference's is
+        markers = self.station.marker_map if host is None else host.markers
+        frame = self.station.scene_graph.world_frame_id()
+        shell = DrawnShell(frame, world.shell.radius, markers, parameters=world.looks)
         X_BC = robot.camera.true_mounting(robot.body, self._scenario.seed)
         return list(camera_views(log, robot.camera.model(), X_BC, shell))
 

@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
 from pydrake.geometry import FrameId
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import ModelInstanceIndex
+from pydrake.systems.primitives import ConstantValueSource
 
 from diagrams.schema import File, ScenarioError, file_path
 from diagrams.world import World
 from plants.magnets import JoinForces
+from plants.relative_pose import FramePose
 from plants.shell import (
     BODY,
     ShellMotion,
@@ -144,26 +147,44 @@ class ShellWorldParameters(World):
         station.shells[name] = Shell(name, model, frame_id, X_WR, markers)
 
     def add_blocks(self, station: StationBuilder, robots: list[Robot]) -> None:
-        """Moves the reference robot, and lets the magnets pull."""
+        """Moves the reference robot, and lets the magnets pull.
+
+        The motion is known: of a recording it is as it was.
+        """
         del robots
-        if not station.simulated:
-            return
+        if station.simulated:
+            self._add_magnets(station)
+        still = ConstantValueSource(AbstractValue.Make(RigidTransform()))
+        pose = station.add(
+            still if self.motion is None else ShellMotion(parameters=self.motion),
+            f"{REFERENCE}.motion",
+        )
+        if self.motion is not None:
+            for name in ("pose", "spatial_velocity"):
+                station.export_output(pose.GetOutputPort(name), f"{REFERENCE}.{name}")
+        if not station.simulated:  # the plant is a model only: somebody has to say where it is
+            shown = station.add(
+                FramePose(frame_id=station.shells[REFERENCE].frame_id), f"{REFERENCE}.frame"
+            )
+            port = "y0" if self.motion is None else "pose"
+            station.connect(pose.GetOutputPort(port), shown.pose_input_port())
+            station.connect(
+                shown.frame_pose_output_port(),
+                station.scene_graph.get_source_pose_port(station.plant.get_source_id()),
+            )
+        elif self.motion is not None:
+            model = station.shells[REFERENCE].model
+            station.connect(
+                pose.GetOutputPort("desired_state"),
+                station.plant.get_desired_state_input_port(model),
+            )
+
+    def _add_magnets(self, station: StationBuilder) -> None:
         forces = station.plant.get_applied_spatial_force_input_port()
         if len(station.pulls) == 1:
             station.connect(station.pulls[0], forces)
-        else:
-            joined = station.add(JoinForces(robots=len(station.pulls)), "magnets")
-            for k, pull in enumerate(station.pulls, start=1):
-                station.connect(pull, joined.GetInputPort(f"forces_{k}"))
-            station.connect(joined.forces_output_port(), forces)
-        if self.motion is not None:
-            motion = station.add(ShellMotion(parameters=self.motion), f"{REFERENCE}.motion")
-            model = station.shells[REFERENCE].model
-            station.connect(
-                motion.desired_state_output_port(),
-                station.plant.get_desired_state_input_port(model),
-            )
-            station.export_output(motion.pose_output_port(), f"{REFERENCE}.pose")
-            station.export_output(
-                motion.spatial_velocity_output_port(), f"{REFERENCE}.spatial_velocity"
-            )
+            return
+        joined = station.add(JoinForces(robots=len(station.pulls)), "magnets")
+        for k, pull in enumerate(station.pulls, start=1):
+            station.connect(pull, joined.GetInputPort(f"forces_{k}"))
+        station.connect(joined.forces_output_port(), forces)

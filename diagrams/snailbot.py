@@ -11,6 +11,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 from pydrake.geometry import Meshcat
 
 from diagrams.drivers.shell_body import ShellStart
@@ -27,6 +28,7 @@ from systems.estimators.madgwick import MadgwickParameters
 from systems.estimators.shell_ekf_parameters import ShellEkfParameters
 from systems.flow.sphere_flow import SphereFlowParameters
 from systems.markers.localizer import LocalizerParameters
+from systems.markers.pnp import rotation_from_vector
 from systems.validation import require
 
 ESTIMATORS = Table(
@@ -39,6 +41,7 @@ ESTIMATORS = Table(
 )
 
 ROBOT = "robot"
+_SAME_PLACE = 0.02  # rad
 
 
 @dataclass
@@ -71,7 +74,7 @@ class Member:
 
     Attributes:
         start: where it stands; the first on the reference robot's shell, each other on the shell of
-            the one before it, unless it says otherwise.
+            the one before it.
         route: `routine` (the paper's), `stand`, or the legs, one after the other.
         speed: along a leg, m/s; left out, the steering's.
     """
@@ -107,7 +110,8 @@ class SnailBotScenario(Scenario):
         iterations: how often each drives its route. The run's `duration` is for one.
         errors: what is wrong with the robots: `none`, `base` or `harsh`, or bounds of your own. It
             replaces the tolerances of world, body, camera and IMU, and the filter is told the
-            bounds where its own are narrower. Left out, those of the devices hold.
+            bounds where its own are narrower. Left out, those of the devices hold. False poses and,
+            where pictures were recorded, missed passages are not in what is played back.
         magnet_force: of each wheel, N; left out, the body's.
         drive_on: the pose that the robots drive on: their own `estimate`, or the `truth`.
         camera: which of the sensors looks down.
@@ -161,6 +165,21 @@ class SnailBotScenario(Scenario):
             imu.rate,
             f"at least the camera's, {camera.rate:g} Hz",
         )
+        require(
+            camera.sight in (None, self.sight) or "rendered" not in (camera.sight, self.sight),
+            f"robot.sensors.{self.camera}.sight",
+            camera.sight,
+            f"left out, where sight is {self.sight}: shells look one way to all cameras",
+        )
+        for k, member in enumerate(self.team):
+            legs = member.legs(1)
+            require(
+                self.iterations == 1 or not legs or closes(legs),
+                f"team[{k}].route",
+                member.route,
+                f"one that ends where it begins, to be driven {self.iterations} times",
+            )
+        self.robots()
         # The resolved scenario says what the filter was told: it is saved, and loaded as given.
         self.estimator = self.told_estimator()
 
@@ -185,9 +204,10 @@ class SnailBotScenario(Scenario):
         robots: dict[str, RobotParameters] = {}
         names = [ROBOT, *(f"{ROBOT}_{k + 1}" for k in range(1, len(self.team)))]
         for k, (name, member) in enumerate(zip(names, self.team, strict=True)):
-            start = member.start
-            if k > 0 and start.on == REFERENCE:
-                start = replace(start, on=names[k - 1])
+            host = names[k - 1] if k else REFERENCE
+            on = member.start.on
+            require(on in ("", host), f"team[{k}].start.on", on, f"left out, or {host}")
+            start = replace(member.start, on=host)
             hardware = self._hardware(carries_shell=k + 1 < len(self.team))
             robots[name] = RobotParameters(**vars(hardware), start=start)  # type: ignore[arg-type]
         return robots
@@ -205,9 +225,10 @@ class SnailBotScenario(Scenario):
             changes["carries_shell"] = True
             changes["rocking"] = replace(built.rocking, bound=0.0)
         robot = replace(self.robot, body=_changed(body, **changes))
-        if errors is None:
-            return robot
         camera, imu = (robot.sensors[name] for name in (self.camera, self.imu))
+        camera = _changed(camera, imu=self.imu)
+        if errors is None:
+            return replace(robot, sensors=robot.sensors | {self.camera: camera})
         latency = camera.build().latency
         bias = math.radians(errors.gyro_bias_deg_s)
         sensors = robot.sensors | {
@@ -255,6 +276,12 @@ class SnailBotScenario(Scenario):
             ValueError: something of the scenario is refused; one line.
         """
         return ShellMission(self, meshcat=meshcat, out=out)
+
+
+def closes(legs: list[Leg]) -> bool:
+    """Whether a route ends at the place where it begins."""
+    end = legs[-1].frame() @ rotation_from_vector(np.array([0.0, legs[-1].arc, 0.0]))
+    return bool(np.linalg.norm(end[:, 2] - legs[0].frame()[:, 2]) < _SAME_PLACE)
 
 
 def _has(target: Any, name: str) -> bool:

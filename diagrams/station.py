@@ -149,7 +149,7 @@ class Robot:
         on: name of whose shell it stands on, of a robot on a shell.
         sensors: its devices by name.
         model: its model instance in the plant.
-        frame_id: geometry frame of its base_link.
+        frame_id: geometry frame of what its sensors are fixed to: base_link, or what rocks on it.
         state: block with the outputs pose, planar_pose, spatial_velocity, spatial_acceleration.
         wheel_speeds: input port that takes [right, left] (rad/s): how the wheels are to turn.
         wheel_rates: output port of [right, left] (rad/s): how they turn.
@@ -181,7 +181,7 @@ class StationBuilder:
         marker_map: the markers as the robots believe them to be.
         true_markers: the markers as they are.
         seed: of all noise.
-        sight: `rendered` or `projected`.
+        sight: `rendered`, `drawn` or `projected`.
         time_step: of the multibody plant, s.
         dynamics: `multibody` or `kinematic`.
         player: the recording that is played back, or None when the station is simulated.
@@ -359,7 +359,7 @@ class Station(Diagram):
             world: what stands around the robots.
             robots: by name.
             seed: of all noise.
-            sight: `rendered` or `projected`.
+            sight: `rendered`, `drawn` or `projected`.
             time_step: of the multibody plant, s.
             dynamics: `multibody`, or `kinematic` for the robots' kinematic twins.
             player: a recording to play back instead of simulating.

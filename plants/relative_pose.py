@@ -1,11 +1,11 @@
-"""Where one frame of a scene is as seen from another: the truth about a robot on a robot."""
+"""Poses of a scene's frames: where one is as seen from another, and where one is to be shown."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import FrameId, QueryObject
+from pydrake.geometry import FrameId, FramePoseVector, QueryObject
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
@@ -61,3 +61,49 @@ class RelativePose(LeafSystem):
         X_WP, X_WC = (query.GetPoseInWorld(frame) for frame in (self._parent, self._child))
         X_PC = X_WP.InvertAndCompose(X_WC)
         output.set_value(X_PC if self._X_CF is None else X_PC @ self._X_CF)
+
+
+class FramePose(LeafSystem):
+    """Tells a SceneGraph where the one frame of a source is.
+
+    .. pydrake_system::
+
+        name: FramePose
+        input_ports:
+        - pose
+        output_ports:
+        - frame_pose
+
+    Args:
+        frame_id: the frame.
+
+    Ports:
+        pose (input, RigidTransform): `X_WF`.
+        frame_pose (output, FramePoseVector): for SceneGraph's port of that source.
+    """
+
+    def __init__(self, *, frame_id: FrameId) -> None:
+        super().__init__()
+        self._frame_id = frame_id
+        self._pose_input = self.DeclareAbstractInputPort(
+            "pose", AbstractValue.Make(RigidTransform())
+        )
+        self._frame_pose_output = self.DeclareAbstractOutputPort(
+            "frame_pose",
+            lambda: AbstractValue.Make(FramePoseVector()),
+            self._calc_frame_pose,
+            {self._pose_input.ticket()},
+        )
+
+    def pose_input_port(self) -> InputPort:
+        """Returns the port of the pose."""
+        return self._pose_input
+
+    def frame_pose_output_port(self) -> OutputPort:
+        """Returns the port for SceneGraph."""
+        return self._frame_pose_output
+
+    def _calc_frame_pose(self, context: Context, output: Any) -> None:
+        poses = FramePoseVector()
+        poses.set_value(self._frame_id, self._pose_input.Eval(context))
+        output.set_value(poses)

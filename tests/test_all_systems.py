@@ -60,7 +60,7 @@ from plants.magnets import JoinForces, MagneticAdhesion
 from plants.motors import DcMotors, MotorModel, MotorParameters
 from plants.moving import MovingCylinder, MovingObstacles
 from plants.planar_shapes import PlanarShapes
-from plants.relative_pose import RelativePose
+from plants.relative_pose import FramePose, RelativePose
 from plants.rocking import RockingBody, RockingParameters
 from plants.shell import ShellMotion, ShellParameters, add_shell
 from plants.shell_rover import ShellRover
@@ -583,6 +583,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
     ),
     PoseToVector: lambda _: Case(PoseToVector(), {"pose": POSES}),
     RelativePose: relative_pose,
+    FramePose: lambda _: Case(FramePose(frame_id=WORLD), {"pose": POSES}),
     MarkersSeen: lambda _: Case(
         MarkersSeen(marker_map=MAP, rate=60.0),
         {"detections": (detections(0.0), detections(0.5, 3.0))},

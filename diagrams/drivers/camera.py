@@ -1,4 +1,4 @@
-"""Drivers of cameras: rendered, projected, or played back; always with their detections."""
+"""Drivers of cameras: rendered, drawn, projected, or played back; always with their detections."""
 
 from __future__ import annotations
 

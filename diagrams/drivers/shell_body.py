@@ -11,7 +11,7 @@ from pydrake.systems.framework import OutputPort
 from pydrake.systems.primitives import MatrixGain
 
 from diagrams.channels import number_signal, shell_truth_signal
-from diagrams.shell_world import REFERENCE, ShellWorldParameters
+from diagrams.shell_world import ShellWorldParameters
 from diagrams.station import Robot, StationBuilder
 from plants.body_state import BodyState
 from plants.magnets import MagneticAdhesion, MagnetParameters
@@ -39,13 +39,14 @@ class ShellStart:
         roll_deg: heading about the outward normal, 0 toward the pole, positive to the left.
         pitch_deg: latitude.
         yaw_deg: longitude.
-        on: whose shell: `reference`, or a robot that carries one.
+        on: whose shell: `reference`, or a robot that carries one; left out, that of the robot
+            before it, the first one's the reference.
     """
 
     roll_deg: float = 0.0
     pitch_deg: float = 0.0
     yaw_deg: float = 0.0
-    on: str = REFERENCE
+    on: str = ""
 
     def __post_init__(self) -> None:
         for name in ("roll_deg", "pitch_deg", "yaw_deg"):

@@ -45,7 +45,7 @@ class ShellCamera(CameraDriver):
         flow: how points are found again in pictures.
         flow_projector: how they are without pictures.
         imu: which of the robot's sensors helps to predict where points go; it comes before the
-            camera in the list.
+            camera in the list. Empty for none.
         processing_time: from the arrival of a picture to its matches, s.
         mounting_tolerance_deg: the camera is turned about its own centre by up to so much, each
             axis, and nobody knows.
@@ -185,8 +185,14 @@ class ShellCamera(CameraDriver):
         return flow.matches_output_port()
 
     def _imu(self, robot: Robot) -> Any:
-        choice = robot.sensors.get(self.imu)
-        return None if choice is None else choice.build()
+        if not self.imu:
+            return None
+        if self.imu not in robot.sensors:
+            known = ", ".join(robot.sensors)
+            raise ScenarioError(
+                f"{robot.name}.sensors: imu is {self.imu!r}: must be one of {known}, or empty"
+            )
+        return robot.sensors[self.imu].build()
 
     def _projected(self, station: StationBuilder, robot: Robot, name: str) -> OutputPort:
         X_RC = station.add(

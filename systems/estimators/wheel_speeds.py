@@ -34,8 +34,8 @@ class WheelSpeeds(LeafSystem):
         max_speed: faster than this no wheel turns, rad/s: a counter that leaps has been reset.
 
     Ports:
-        ticks (input, vector of 2): counts [right, left]. Not finite: dropped and counted, the speed
-            is held.
+        ticks (input, vector of 2): counts [right, left]. Not finite: dropped and counted, and the
+            wheels are taken to go on as before.
         wheel_speeds (output, vector of 2): [right, left], rad/s, at `rate`; zeros before the
             second reading: until then the wheels stood.
         health (output, Health): `bad_ticks`, counts that were not finite; `leap`, counts that were
@@ -82,16 +82,20 @@ class WheelSpeeds(LeafSystem):
 
     def _read(self, context: Context, discrete_state: DiscreteValues) -> None:
         ticks = self._ticks_input.Eval(context)
-        if not np.isfinite(ticks).all():
-            self._counts.add(context, discrete_state, bad_ticks=1)
-            return
         readings = context.get_discrete_state(self._readings).get_value().reshape(-1, 2)
-        if math.isnan(readings[0, 0]):  # the first: until then they stood
-            readings = np.tile(ticks, (len(readings), 1))
+        sound = bool(np.isfinite(ticks).all())
+        if math.isnan(readings[0, 0]):
+            if not sound:
+                self._counts.add(context, discrete_state, bad_ticks=1)
+                return
+            readings = np.tile(ticks, (len(readings), 1))  # until then they stood
         step = (readings[-1] - readings[0]) / (len(readings) - 1)
-        if (np.abs(ticks - readings[-1]) > self._most).any():
+        if not sound:
+            self._counts.add(context, discrete_state, bad_ticks=1)
+            ticks = readings[-1] + step  # as if it had gone on as before
+        elif (np.abs(ticks - readings[-1]) > self._most).any():
             self._counts.add(context, discrete_state, leap=1)
-            readings = readings + (ticks - readings[-1] - step)  # as if it had gone on as before
+            readings = readings + (ticks - readings[-1] - step)
         readings = np.vstack([readings[1:], ticks])
         speeds = self._angle * (readings[-1] - readings[0]) / ((len(readings) - 1) * self._dt)
         discrete_state.set_value(self._readings, readings.ravel())

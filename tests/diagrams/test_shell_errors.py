@@ -179,9 +179,30 @@ def test_each_robot_stands_on_the_one_before_it() -> None:
     assert [r.start.on for r in robots.values()] == ["reference", "robot", "robot_2"]
 
 
-def test_two_may_stand_on_one() -> None:
-    robots = scenario("team=[{}, {}, {start: {on: robot, yaw_deg: 90}}]").robots()
-    assert robots["robot_3"].start.on == "robot"
+def test_each_stands_on_the_one_before_it() -> None:
+    robots = scenario("team=[{}, {start: {yaw_deg: 90}}, {start: {on: robot_2}}]").robots()
+    assert [robot.start.on for robot in robots.values()] == ["reference", "robot", "robot_2"]
+
+
+def test_the_camera_predicts_by_the_gyro_of_the_scenario() -> None:
+    renamed = "robot.sensors={gyro: bmi088, camera: {type: shell_camera, calibration: ov9281.yaml}}"
+    for errors in ("errors=base", "errors=null"):
+        _, camera, _ = robot(renamed.replace("gyro", "imu"), errors)
+        assert camera.imu == "imu"
+
+
+def test_a_route_is_driven_twice_only_where_it_ends_as_it_begins() -> None:
+    open_one = "team=[{route: [{roll_deg: 0, pitch_deg: 0, yaw_deg: 0, arc_deg: 180}]}]"
+    scenario(open_one)
+    with pytest.raises(ValueError, match=r"team\[0\].route is .*to be driven 2 times"):
+        scenario(open_one, "iterations=2")
+    scenario(open_one.replace("180", "360"), "iterations=2")
+    scenario("iterations=5")
+
+
+def test_the_filter_is_told_of_a_delay() -> None:
+    told = scenario("errors={delay: 0.1}").estimator.arguments["parameters"]
+    assert told.delay_std == 0.1
 
 
 def test_those_who_carry_do_not_rock() -> None:

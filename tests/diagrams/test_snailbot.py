@@ -98,7 +98,8 @@ def test_it_climbs_and_knows_where_it_is(climb: Any) -> None:
 
 def test_the_report_is_whole_and_finite(climb: Any) -> None:
     learned = {"mounting_error_deg", "flow_scale_error", "delay_error_ms"}
-    assert set(climb.report["metrics"]) == {*NAMES, "min_adhesion_margin", *learned}
+    others = {"min_adhesion_margin", "nis_mean"}
+    assert set(climb.report["metrics"]) == {*NAMES, *others, *learned}
     assert np.isfinite(list(climb.report["metrics"].values())).all()
 
 

@@ -171,9 +171,15 @@ def test_where_the_bundled_file_says_it_its_line_is_told(refuse: Refuse) -> None
     ("override", "line"),
     [
         ("team=[{start: {on: robot_2}}, {}]",
-         "robot.start.on is 'robot_2': must be whose shell is there before it: reference"),
+         "--set team: team[0].start.on is 'robot_2': must be left out, or reference"),
         ("team=[{}, {start: {on: robot_9}}]",
-         "robot_2.start.on is 'robot_9': must be whose shell is there before it: reference, robot"),
+         "--set team: team[1].start.on is 'robot_9': must be left out, or robot"),
+        ("team=[{}, {}, {start: {on: robot}}]",
+         "--set team: team[2].start.on is 'robot': must be left out, or robot_2"),
+        ("robot.sensors.camera.sight=rendered",
+         "--set robot.sensors.camera.sight: robot.sensors.camera.sight is 'rendered': must be left "
+         "out, where sight is projected: shells look one way to all cameras"),
+        ("errors={delay: 0.3}", "--set errors: errors.delay is 0.3: must be at most 0.2 s"),
         ("robot.drive=dc_motors",
          "robot.drive is 'dc_motors': must be wheel_servo: of this body nothing tells how the "
          "wheels turn"),

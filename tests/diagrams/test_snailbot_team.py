@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
@@ -193,3 +194,21 @@ def test_the_known_motion_is_that_of_the_shell_in_its_own_frame(told: Run) -> No
     velocity = mission.robots[0].value("shell_motion.reference_velocity", told.context)
     np.testing.assert_allclose(velocity[:3], rate, atol=1e-9)
     assert np.linalg.norm(rate) > 0.3
+
+
+@pytest.mark.parametrize("name", ["snailbot_chain", "snailbot_moving_reference"])
+def test_a_recording_is_played_in_meshcat_with_the_same_estimates(
+    name: str, tagtrail: Callable[..., Any], tmp_path: Path
+) -> None:
+    """On the shell of a robot that moves, too: its motion is known, and shown."""
+    short = ("--set", "sight=projected", "--set", "duration=0.5")
+    made = tagtrail("run", name, *short, "--no-meshcat", "--out", tmp_path / "a")
+    assert made.status == 1  # the time was up
+    played = tagtrail("run", name, *short, "--play", tmp_path / "a/bag", "--out", tmp_path / "b")
+    assert played.err == "" or "Meshcat" in played.err
+    assert (tmp_path / "b/replay.html").is_file()
+    for path in (tmp_path / "a").glob("estimate*.tum"):
+        before, after = (np.loadtxt(folder / path.name) for folder in (path.parent, tmp_path / "b"))
+        n = min(len(before), len(after))
+        assert n > 20
+        np.testing.assert_array_equal(before[:n], after[:n])
