@@ -13,7 +13,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.geometry import FrameId
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 from pydrake.systems.framework import OutputPort
-from pydrake.systems.primitives import ConstantValueSource
+from pydrake.systems.primitives import ConstantValueSource, PassThrough
 
 from diagrams.channels import detections_signal, image_signal, topic_of
 from diagrams.schema import File, ScenarioError, file_path
@@ -63,8 +63,8 @@ class CameraDriver(ABC):
 
     Ports of the station: `{robot}.{device}.image` (CameraImage; of size 0 when there are none, as
     under projected sight), `{robot}.{device}.detections` (Detections), `{robot}.{device}.health`;
-    an input, of a simulated camera, `{robot}.{device}.active` (vector of 1): while it is 0 no
-    pictures are taken; it may be left unconnected.
+    an input `{robot}.{device}.active` (vector of 1): while it is 0 no pictures are taken, of a
+    simulated camera; it may be left unconnected.
 
     Attributes:
         calibration: camera file (bundled, or beside the scenario).
@@ -185,6 +185,8 @@ class CameraDriver(ABC):
         """
         if not station.simulated:
             self._check_recorded_size(station, name, camera)
+            unheard = station.add(PassThrough(1), f"{name}.switch")
+            station.export_input(unheard.get_input_port(), f"{name}.active")
             if self._plays_pictures(station, name):
                 return station.play(image_signal(name, self.rate)), None
             return None, station.play(detections_signal(name, self.rate))

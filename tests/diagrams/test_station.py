@@ -50,6 +50,7 @@ def test_the_ports_are_those_that_the_design_names(simulated: dict[str, set[Port
     vector, abstract = str(PortDataType.kVectorValued), str(PortDataType.kAbstractValued)
     assert simulated["rendered, multibody"] == {
         ("in robot.drive.command", vector, 2, ""),
+        ("in robot.front_camera.active", vector, 1, ""),
         ("out robot.drive.sent", vector, 2, ""),
         ("out robot.drive.health", abstract, 0, "Health"),
         ("out robot.front_camera.image", abstract, 0, "CameraImage"),
