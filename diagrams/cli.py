@@ -17,7 +17,10 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
+from systems.validation import require
+
 if TYPE_CHECKING:
+    from diagrams.formation_studies import ModelStudy
     from diagrams.study_report import TextTable
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -62,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
         sub.set_defaults(function=function)
         return sub
 
-    command("list", _list, "list the bundled scenarios")
+    command("list", _list, "list the bundled scenarios and studies of models")
 
     run = command("run", _run, "simulate one run, or play a recording back")
     run.add_argument("scenario", help="bundled name or path of a scenario file")
@@ -79,7 +82,9 @@ def _parser() -> argparse.ArgumentParser:
     run.add_argument("--play", metavar="RECORDING", help="sensors come from this recording")
 
     study = command("study", _study, "do many seeded runs, also of variants, and compare them")
-    study.add_argument("scenario", help="bundled name or path of a scenario file")
+    study.add_argument(
+        "scenario", help="bundled name or path of a scenario file, or name of a study of models"
+    )
     study.add_argument(
         "--runs", type=int, default=30, metavar="N", help="of each variant, seeds 0 to N-1 [30]"
     )
@@ -119,12 +124,15 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(_: argparse.Namespace) -> int:
+    from diagrams.formation_studies import STUDIES
     from diagrams.scenario import bundled_scenarios, read_layers
 
     bundled = bundled_scenarios()
-    width = max(map(len, bundled))
+    width = max(map(len, [*bundled, *STUDIES]))
     for name, path in bundled.items():
         console.print(f"{name:{width}}  {read_layers(path).data.get('description', '')}")
+    for name, study in STUDIES.items():
+        console.print(f"{name:{width}}  {study.description} (tagtrail study)")
     return 0
 
 
@@ -154,6 +162,29 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _study(options: argparse.Namespace) -> int:
+    from diagrams.formation_studies import STUDIES
+
+    if options.scenario in STUDIES:
+        return _model_study(options, STUDIES[options.scenario])
+    return _scenario_study(options)
+
+
+def _model_study(options: argparse.Namespace, study: ModelStudy) -> int:
+    for key in ("sweep", "set", "keep"):
+        if getattr(options, key):
+            raise ValueError(f"--{key} is not for {options.scenario}, a study of models")
+    require(options.runs >= 2, "--runs", options.runs, "2 or more")
+    out = options.out or Path("out") / "study" / options.scenario
+    out.mkdir(parents=True, exist_ok=True)
+    numbers = study.run(out, options.runs)
+    _print_table(study.table(numbers))
+    for note in study.notes(numbers):
+        console.print(note)
+    console.print(f"results: {out}")
+    return 0
+
+
+def _scenario_study(options: argparse.Namespace) -> int:
     from diagrams.study import load_study, run_study
     from diagrams.study_plots import plot_study
     from diagrams.study_report import summarize, text_tables, write_summary

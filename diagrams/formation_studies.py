@@ -2,7 +2,8 @@
 
 `formation_error_model` says how exactly one triangle is built, `formation_table1` what comes of it
 after many. Nothing here is simulated in the plant: the error of a triangle comes from a source that
-is handed in, and by default is the paper's own distribution.
+is handed in. By default the first simulates Algorithm I in many worlds of kinematics and projection
+at once, and the second draws from the paper's own distribution.
 
 [FORM]: Kang, Kwon, Bae, Kim, "Monocular Vision-Based Swarm Robot Localization Using Equilateral
 Triangular Formations".
@@ -13,6 +14,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -36,8 +38,10 @@ from diagrams.formation_table import (
     study_random,
     table1,
 )
+from diagrams.study_report import TextTable
 from systems.formation.dead_reckoning import DeadReckoningParameters
 from systems.formation.error_models import FoldedNormalErrors, StepErrors
+from systems.formation.trials import Algorithm1Trials
 from systems.validation import require
 
 Array = NDArray[np.float64]
@@ -46,6 +50,7 @@ Array = NDArray[np.float64]
 PAPER_ERRORS = {"lateral": (0.036, 0.021), "longitudinal": (0.013, 0.009)}
 
 PAPER_SOURCE = "the paper's distribution"
+ALGORITHM1_SOURCE = "Algorithm I"
 
 # --- One triangle ---
 
@@ -63,16 +68,17 @@ def formation_error_model(
         folder: an existing one.
         trials: how many triangles are built.
         seed: of the study.
-        errors: builds the triangles; by default draws from the paper's distribution, which then
-            comes out but for the trials' finite number.
+        errors: builds the triangles; by default simulates Algorithm I under conditions that are
+            ours, as the paper does not state them. `FoldedNormalErrors()` is the paper's
+            distribution, which then comes out but for the trials' finite number.
 
     Raises:
         ValueError: too few trials.
     """
     require(trials >= 2, "trials", trials, "2 or more")
-    drawn = (errors or FoldedNormalErrors()).draw(study_random(seed, "error_model"), (trials,))
+    drawn = (errors or Algorithm1Trials()).draw(study_random(seed, "error_model"), (trials,))
     ended = drawn[np.isfinite(drawn).all(axis=1)]
-    source = PAPER_SOURCE if errors is None else type(errors).__name__
+    source = ALGORITHM1_SOURCE if errors is None else type(errors).__name__
     numbers: Numbers = {
         "errors_from": source,
         "trials": trials,
@@ -86,13 +92,22 @@ def formation_error_model(
             "paper_standard_deviation_m": paper[1],
         }
     _write(folder / "error_model.json", numbers)
-    header = ["[mm]", "bias", "mean", "± std", "95 %", "largest", "paper: mean", "± std"]
-    rows = [[axis, *(_scaled(v, 1000, 1) for v in row.values())]
-            for axis, row in numbers["axes"].items()]  # fmt: skip
-    title = f"Error of building a triangle, from {source}: {len(ended)} of {trials} trials ended"
-    plot_table(folder / "error_model.png", title, header, rows, [])
+    table = _error_model_table(numbers)
+    plot_table(folder / "error_model.png", table.title, table.header, table.rows, [])
     plot_cdfs(folder / "error_cdf.png", np.abs(ended), PAPER_ERRORS, source)
     return numbers
+
+
+def _error_model_table(numbers: Numbers) -> TextTable:
+    header = ["[mm]", "bias", "mean", "± std", "95 %", "largest", "paper: mean", "± std"]
+    rows = [
+        [axis, *(_scaled(value, 1000, 1) for value in row.values())]
+        for axis, row in numbers["axes"].items()
+    ]
+    trials = numbers["trials"]
+    ended = f"{trials - numbers['not_ended']} of {trials} trials ended"
+    title = f"Error of building a triangle, from {numbers['errors_from']}: {ended}"
+    return TextTable(title, header, rows, [len(rows)])
 
 
 def _statistics(signed: Array) -> dict[str, float | None]:
@@ -140,14 +155,16 @@ def formation_table1(
         "sides": by_side(runs=runs, seed=seed, errors=source),
     }
     _write(folder / "table1.json", numbers)
-    plot_table(folder / "table1.png", *_table_text(numbers))
+    table = _table1_table(numbers)
+    notes = _table1_notes(numbers, "Bold")
+    plot_table(folder / "table1.png", table.title, table.header, table.rows, notes)
     plot_over_time(folder / "error_over_time.png", over_time)
     plot_robots(folder / "error_by_robots.png", numbers["robots"])
     plot_sides(folder / "error_by_side.png", numbers["sides"])
     return numbers
 
 
-def _table_text(numbers: Numbers) -> tuple[str, list[str], list[list[str]], list[str]]:
+def _table1_table(numbers: Numbers) -> TextTable:
     header = ["mean error at the destination [m]"]
     header += [f"{path}, {speed:g} rad/s" for path in PATHS for speed in WHEEL_SPEEDS]
     rows: list[list[str]] = []
@@ -157,9 +174,14 @@ def _table_text(numbers: Numbers) -> tuple[str, list[str], list[list[str]], list
     for name, by_path in PAPER.items():
         row = [f"{value:.2f}" for path in PATHS for value in by_path[path]]
         rows.append([f"paper: {name}", *row])
+    return TextTable("Table 1", header, rows, [len(rows) - len(PAPER), len(PAPER)])
+
+
+def _table1_notes(numbers: Numbers, mark: str) -> list[str]:
+    """Returns what the table means; `mark` is what cells that begin with * are called."""
     moves = [numbers["table"]["triangles, sum"][path][0]["moves"] for path in PATHS]
-    notes = [
-        f"{numbers['runs']} runs; ± is the standard error of the mean. Bold: within 15 % of the "
+    return [
+        f"{numbers['runs']} runs; ± is the standard error of the mean. {mark}: within 15 % of the "
         "paper's (of triangles: of the mean of its two speeds).",
         f"Triangles: {moves[0]} and {moves[1]} moves at any speed, errors of each from "
         f"{numbers['errors_from']}. sum: added as if each triangle's orientation were known.",
@@ -168,7 +190,6 @@ def _table_text(numbers: Numbers) -> tuple[str, list[str], list[list[str]], list
         f"Dead reckoning sampled every {numbers['period_s']:g} s. gyro bias: an integrated bias of "
         f"the heading's rate of {math.degrees(GYRO_BIAS):g} deg/s (standard deviation), ours.",
     ]
-    return "Table 1", header, rows, notes
 
 
 def _for_each_speed(cells: list[Numbers]) -> list[Numbers]:
@@ -195,7 +216,37 @@ def _write(path: Path, numbers: Numbers) -> None:
     path.write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n")
 
 
-STUDIES: dict[str, Callable[..., Numbers]] = {
-    "formation_error_model": formation_error_model,
-    "formation_table1": formation_table1,
+# --- By name ---
+
+
+@dataclass(frozen=True)
+class ModelStudy:
+    """A study that the command line knows by name.
+
+    Attributes:
+        description: a line.
+        run: writes its files into an existing folder, from so many runs; returns all numbers.
+        table: of the numbers.
+        notes: lines below the table.
+    """
+
+    description: str
+    run: Callable[[Path, int], Numbers]
+    table: Callable[[Numbers], TextTable]
+    notes: Callable[[Numbers], list[str]]
+
+
+STUDIES = {
+    "formation_error_model": ModelStudy(
+        "Error of building one triangle by Algorithm I, beside the paper's numbers",
+        lambda folder, runs: formation_error_model(folder, trials=runs),
+        _error_model_table,
+        lambda _: [],
+    ),
+    "formation_table1": ModelStudy(
+        "Error of triangles and of dead reckoning at the destination, beside the paper's table 1",
+        lambda folder, runs: formation_table1(folder, runs=runs),
+        _table1_table,
+        lambda numbers: _table1_notes(numbers, "*"),
+    ),
 }

@@ -11,21 +11,21 @@ import numpy as np
 
 from systems.formation.bearing_filter import BearingFilterParameters
 from systems.formation.bearings import cramer_rao, lateral_pixels, pixel_covariance, resect
-from systems.formation.triangles import arrival_heading, components
-from tests.benchmarks.table import Row, show
-from tests.triangle_world import (
-    ANCHOR,
-    BEACONS,
-    FOCAL,
-    VERTEX,
-    Conditions,
+from systems.formation.trials import (
     Outcome,
+    TrialParameters,
+    beacons_of,
     build_by_algorithm1,
     build_by_resection,
 )
+from systems.formation.triangles import arrival_heading, components, next_vertex
+from tests.benchmarks.table import Row, show
 
+FOCAL = 485.0
+BEACONS = beacons_of(1.5)
+ANCHOR, VERTEX = BEACONS[2], next_vertex(BEACONS)
 TRIALS = 200
-BIASED = Conditions()
+BIASED = TrialParameters()
 CALIBRATED = replace(BIASED, centre_bias=0.0)
 
 

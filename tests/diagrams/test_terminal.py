@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from diagrams.formation_studies import STUDIES
 from systems.io.bag import BagReader
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -45,7 +46,7 @@ def test_the_installed_command_lists_the_scenarios_a_line_each(tmp_path: Path) -
     assert finished.stderr == ""
     names = [line.split()[0] for line in finished.stdout.splitlines()]
     bundled = sorted(path.stem for path in (ROOT / "diagrams" / "scenarios").glob("*.yaml"))
-    assert names == bundled
+    assert names == [*bundled, *STUDIES]
     assert "navigation_open" in names
 
 

@@ -16,17 +16,18 @@ from systems.formation.building import (
     algorithm1,
     settle,
 )
-from tests.triangle_world import (
-    ANCHOR,
-    BEACONS,
-    FOCAL,
-    VERTEX,
-    Conditions,
+from systems.formation.trials import (
+    TrialParameters,
+    beacons_of,
     build_by_algorithm1,
     build_by_resection,
 )
+from systems.formation.triangles import next_vertex
 
-BIASED = Conditions()
+FOCAL = 485.0
+BEACONS = beacons_of(1.5)
+ANCHOR, VERTEX = BEACONS[2], next_vertex(BEACONS)
+BIASED = TrialParameters()
 CALIBRATED = replace(BIASED, centre_bias=0.0)
 PLAIN, OURS = Algorithm1Parameters(), SettlingParameters()
 
