@@ -266,7 +266,8 @@ class DcMotors(LeafSystem):
         return self._steady_speeds_output
 
     def _duty(self, context: Context) -> Array:
-        return np.clip(self._pwm_input.Eval(context) / PWM_LEVELS, -1.0, 1.0)
+        duty: Array = self._pwm_input.Eval(context) / PWM_LEVELS
+        return np.minimum(np.maximum(duty, -1.0), 1.0)
 
     def _calc_torque(self, context: Context, output: Any) -> None:
         speeds = self._speeds_input.Eval(context)

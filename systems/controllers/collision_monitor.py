@@ -130,14 +130,15 @@ def stopping_paths(
 
     def toward(start: Array, end: Array, dt: Array) -> Array:
         reach = change * dt[:, None]
-        return start + np.clip(end - start, -reach, reach)
+        return start + np.minimum(np.maximum(end - start, -reach), reach)
 
     fastest = np.abs(np.vstack([commands, sent, held])).max(axis=0)
     brake = p.reaction_time + p.slowdown_time
     n = math.ceil((brake + float((fastest / change).max())) / _STEP)
     t = (np.arange(n) + 0.5) * _STEP
     speed = toward(sent, held, np.minimum(t, p.reaction_time))
-    speed = toward(speed, commands[:, None], np.clip(t - p.reaction_time, 0, p.slowdown_time))
+    following = np.minimum(np.maximum(t - p.reaction_time, 0), p.slowdown_time)
+    speed = toward(speed, commands[:, None], following)
     speed = toward(speed, np.zeros(2), np.maximum(t - brake, 0))
     turned = np.cumsum(speed[..., 1] * _STEP, axis=-1)
     heading = turned - speed[..., 1] * _STEP / 2
@@ -175,7 +176,7 @@ def are_safe(
     if len(points) == 0:
         return np.ones(len(commands), bool)
     now = clearance(points, hull)
-    driving = np.clip(now.min(), parameters.contact_margin, parameters.margin)
+    driving = min(max(now.min(), parameters.contact_margin), parameters.margin)
     room = np.where(commands[:, 0] == 0, parameters.contact_margin, driving)
     limit = np.minimum(room[:, None, None], now) - _FUZZ
     c, s = np.cos(paths[..., 2, None]), np.sin(paths[..., 2, None])

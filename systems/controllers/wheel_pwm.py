@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 def pulse_widths(duty: Array) -> Array:
     """Returns whole numbers from -255 to 255, the nearest to duty cycles from -1 to 1."""
-    return np.rint(255.0 * np.clip(duty, -1.0, 1.0))
+    return np.rint(255.0 * np.minimum(np.maximum(duty, -1.0), 1.0))
 
 
 class WheelPwm(LeafSystem):

@@ -23,6 +23,7 @@ from systems.validation import require, require_non_negative, require_positive
 Array = NDArray[np.float64]
 
 _TAIL = 4.0
+_TOLERANCE = 1e-5  # of chi-square: the pose is then within a hundredth of its deviation
 _HOPELESS = 1000.0  # chi-square by which a second minimum cannot come near the first any more
 
 REASONS = ("unknown_id", "repeated_id", "too_small", "bad_corners", "outlier", "inconsistent")
@@ -108,6 +109,7 @@ class _View:
             self.points.reshape(-1, 3),
             self.rays.reshape(-1, 2),
             self.by_ray.reshape(-1, 2, 2),
+            tolerance=_TOLERANCE,
             hopeless=_HOPELESS,
         )
 
