@@ -20,7 +20,7 @@ from rich.table import Table as RichTable
 from systems.validation import require
 
 if TYPE_CHECKING:
-    from diagrams.formation_studies import ModelStudy
+    from diagrams.model_studies import ModelStudy
     from diagrams.study_report import TextTable
 
 console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -124,7 +124,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _list(_: argparse.Namespace) -> int:
-    from diagrams.formation_studies import STUDIES
+    from diagrams.model_studies import STUDIES
     from diagrams.scenario import bundled_scenarios, read_layers
 
     bundled = bundled_scenarios()
@@ -162,7 +162,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _study(options: argparse.Namespace) -> int:
-    from diagrams.formation_studies import STUDIES
+    from diagrams.model_studies import STUDIES
 
     if options.scenario in STUDIES:
         return _model_study(options, STUDIES[options.scenario])
@@ -176,9 +176,9 @@ def _model_study(options: argparse.Namespace, study: ModelStudy) -> int:
     require(options.runs >= 2, "--runs", options.runs, "2 or more")
     out = options.out or Path("out") / "study" / options.scenario
     out.mkdir(parents=True, exist_ok=True)
-    numbers = study.run(out, options.runs)
-    _print_table(study.table(numbers))
-    for note in study.notes(numbers):
+    findings = study.run(out, options.runs)
+    _print_table(findings.table)
+    for note in findings.notes:
         console.print(note)
     console.print(f"results: {out}")
     return 0

@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +36,7 @@ from diagrams.formation_table import (
     study_random,
     table1,
 )
+from diagrams.model_studies import Findings
 from diagrams.study_report import TextTable
 from systems.formation.dead_reckoning import DeadReckoningParameters
 from systems.formation.error_models import FoldedNormalErrors, StepErrors
@@ -216,37 +215,15 @@ def _write(path: Path, numbers: Numbers) -> None:
     path.write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n")
 
 
-# --- By name ---
+# --- By name, see `diagrams.model_studies` ---
 
 
-@dataclass(frozen=True)
-class ModelStudy:
-    """A study that the command line knows by name.
-
-    Attributes:
-        description: a line.
-        run: writes its files into an existing folder, from so many runs; returns all numbers.
-        table: of the numbers.
-        notes: lines below the table.
-    """
-
-    description: str
-    run: Callable[[Path, int], Numbers]
-    table: Callable[[Numbers], TextTable]
-    notes: Callable[[Numbers], list[str]]
+def error_model_findings(folder: Path, runs: int) -> Findings:
+    """Does `formation_error_model` and returns what to print of it."""
+    return Findings(_error_model_table(formation_error_model(folder, trials=runs)), [])
 
 
-STUDIES = {
-    "formation_error_model": ModelStudy(
-        "Error of building one triangle by Algorithm I, beside the paper's numbers",
-        lambda folder, runs: formation_error_model(folder, trials=runs),
-        _error_model_table,
-        lambda _: [],
-    ),
-    "formation_table1": ModelStudy(
-        "Error of triangles and of dead reckoning at the destination, beside the paper's table 1",
-        lambda folder, runs: formation_table1(folder, runs=runs),
-        _table1_table,
-        lambda numbers: _table1_notes(numbers, "*"),
-    ),
-}
+def table1_findings(folder: Path, runs: int) -> Findings:
+    """Does `formation_table1` and returns what to print of it."""
+    numbers = formation_table1(folder, runs=runs)
+    return Findings(_table1_table(numbers), _table1_notes(numbers, "*"))

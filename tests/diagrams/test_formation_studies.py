@@ -14,13 +14,9 @@ from numpy.typing import NDArray
 import diagrams.formation_table as formation_table
 from diagrams.cli import console
 from diagrams.formation_plots import folded_normal_cdf
-from diagrams.formation_studies import (
-    STUDIES,
-    ModelStudy,
-    formation_error_model,
-    formation_table1,
-)
+from diagrams.formation_studies import formation_error_model, formation_table1
 from diagrams.formation_table import PAPER, PATHS, by_robots, by_side, table1
+from diagrams.model_studies import STUDIES, ModelStudy
 from systems.formation.error_models import FoldedNormalErrors, MeasuredErrors
 from systems.formation.trials import Algorithm1Trials
 

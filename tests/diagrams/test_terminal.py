@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from diagrams.formation_studies import STUDIES
+from diagrams.model_studies import STUDIES
 from systems.io.bag import BagReader
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -48,6 +48,17 @@ def test_the_installed_command_lists_the_scenarios_a_line_each(tmp_path: Path) -
     bundled = sorted(path.stem for path in (ROOT / "diagrams" / "scenarios").glob("*.yaml"))
     assert names == [*bundled, *STUDIES]
     assert "navigation_open" in names
+
+
+def test_to_list_what_there_is_loads_neither_plots_nor_the_simulator() -> None:
+    program = (
+        "import sys; from diagrams.cli import main; main(['list']);"
+        "print([name for name in ('matplotlib', 'diagrams.run') if name in sys.modules])"
+    )
+    finished = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True
+    )
+    assert finished.stdout.splitlines()[-1] == "[]", finished.stderr
 
 
 def test_a_failed_run_ends_with_1_and_bad_input_with_2(tmp_path: Path) -> None:
