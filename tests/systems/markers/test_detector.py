@@ -197,6 +197,26 @@ def test_faint_and_small_markers_are_left_out_on_demand(name: str) -> None:
         assert len(MarkerDetector(family=name, parameters=parameters).detect(image)) == count
 
 
+def test_noise_below_the_least_contrast_is_no_print_and_small_markers_stay() -> None:
+    noise = np.random.default_rng(5).normal(0.0, 2.0, (480, 640))
+    picture = np.full((480, 640), 180.0)
+    upright = printed("tag36h11", 7, cell=2, margin=1)  # a side of 16 px
+    picture[100:120, 200:220] = upright * 0.6 + 30
+    faint = printed("tag36h11", 8, cell=4, margin=1)
+    picture[300:340, 300:340] = 172 + faint * (20 / 255)
+    picture = np.clip(np.rint(picture + noise), 0, 255).astype(np.uint8)
+    found = {}
+    for contrast in (5.0, 15.0, 40.0):
+        parameters = DetectorParameters(min_contrast=contrast, min_decision_margin=0.0)
+        detector = MarkerDetector(family="tag36h11", parameters=parameters)
+        found[contrast] = detector.detect(picture)
+    assert set(found[5.0].ids) == {7, 8}
+    assert set(found[15.0].ids) == {7, 8}
+    assert set(found[40.0].ids) == {7}  # the other one's print differs by 20 levels
+    corners = [f.corners[f.ids.tolist().index(7)] for f in (found[5.0], found[40.0])]
+    np.testing.assert_allclose(corners[0], corners[1], atol=0.01)
+
+
 def clutter() -> list[Grey]:
     """Pictures without a marker in which engines see some: noise, gravel, checkers, letters."""
     rng = np.random.default_rng(3)
@@ -384,6 +404,8 @@ def test_what_is_no_picture_is_refused(bad: Any) -> None:
         ("decimate", 0.5),
         ("decimate", float("inf")),
         ("blur", -0.1),
+        ("min_contrast", 4.0),
+        ("min_contrast", float("nan")),
     ],
 )
 def test_nonsense_parameters_are_refused_by_name(field: str, value: float) -> None:
