@@ -109,7 +109,8 @@ class ClearanceMonitor(LeafSystem):
         self._contacts_output = self.DeclareVectorOutputPort(
             "contacts", 1, self._calc_contacts, {self.discrete_state_ticket(self._state)}
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        if count:
+            self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
 
     def pose_input_port(self) -> InputPort:
         """Returns the port of the robot's pose."""
@@ -132,6 +133,8 @@ class ClearanceMonitor(LeafSystem):
         return self._contacts_output
 
     def _calc_distances(self, context: Context, output: Any) -> None:
+        if output.size() == 0:
+            return
         robot = self._footprint.moved(self._pose_input.Eval(context))
         obstacles = self._standing
         if len(self._moving):
