@@ -11,13 +11,15 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
-from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource, Demultiplexer
+from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 
 from diagrams.formation_metrics import FormationLog, formation_metrics
 from diagrams.formation_summary import plot_formation
+from diagrams.formation_viewer import FormationViewer
 from diagrams.mission import Mission, Wiring
 from diagrams.trajectories import write_tum
 from plants.formation_arena import known_obstacles
+from systems.controllers.formation_cameras import FormationCameras
 from systems.planners.failure import Failure
 from systems.planners.formation_planner import FormationPlanner
 from systems.planners.formation_turns import FormationTurns
@@ -38,7 +40,11 @@ class FormationMission(Mission):
     ) -> None:
         """See `FormationScenario.build`."""
         wiring = Wiring(
-            scenario, world=scenario.world, robots=scenario.station_robots(), meshcat=meshcat
+            scenario,
+            world=scenario.world,
+            robots=scenario.station_robots(),
+            meshcat=meshcat,
+            frame_rate=_FRAME_RATE,
         )
         self.station = wiring.station
         self._scenario = scenario
@@ -48,6 +54,8 @@ class FormationMission(Mission):
         self._connect()
         self._has_truth = wiring.has_output(f"truth.{self._names[0]}.pose")
         self._log()
+        if meshcat is not None:
+            self._show(meshcat)
         self.recorder = wiring.add_recorder(out)
         self.diagram, self.logs = wiring.build("formation")
 
@@ -73,7 +81,7 @@ class FormationMission(Mission):
         wiring.add(ConstantVectorSource(scenario.destination), "destination")
         obstacles = known_obstacles(scenario.world.arena)
         wiring.add(ConstantValueSource(AbstractValue.Make(obstacles)), "obstacles")
-        wiring.add(Demultiplexer(scenario.robots), "looking")
+        wiring.add(FormationCameras(robots=scenario.robots, cameras=CAMERAS), "cameras")
 
     def _connect(self) -> None:
         wiring = self._wiring
@@ -83,13 +91,14 @@ class FormationMission(Mission):
                 wiring.connect(detections, f"controller_{k}.{camera.split('_')[0]}_detections")
                 if wiring.has_block("estimator"):
                     wiring.connect(detections, f"estimator.robot{k}_{camera}")
+                wiring.connect(detections, f"cameras.robot{k}_{camera}")
                 active = f"{name}.{camera}.active"
                 if wiring.has_input(active):
-                    wiring.connect(f"looking.y{k}", active)
+                    wiring.connect(f"cameras.robot{k}_{camera}_active", active)
             wiring.connect(f"turns.task_{k}", f"controller_{k}.task")
             wiring.connect(f"controller_{k}.status", f"turns.status_{k}")
             wiring.connect(f"controller_{k}.command", f"{name}.drive.command")
-        wiring.connect("turns.looking", "looking.u0")
+        wiring.connect("turns.looking", "cameras.looking")
         if wiring.has_block("estimator"):
             wiring.connect("turns.moving", "estimator.moving")
             wiring.connect("estimator.poses", "turns.poses")
@@ -106,6 +115,27 @@ class FormationMission(Mission):
         for name in [*names, "estimator.poses", "estimator.covariance"]:
             if self._wiring.has_output(name):
                 self._wiring.log(name, _LOG_RATE)
+
+    def _show(self, meshcat: Meshcat) -> None:
+        wiring, scenario = self._wiring, self._scenario
+        viewer = FormationViewer(
+            meshcat=meshcat,
+            robots=scenario.robots,
+            destination=np.array(scenario.destination),
+            rate=_FRAME_RATE,
+        )
+        wiring.add(viewer, "viewer")
+        wiring.connect("planner.move", "viewer.move")
+        for name in ("moving", "record", "positions"):
+            wiring.connect(f"turns.{name}", f"viewer.{name}")
+        if wiring.has_block("estimator"):
+            for name in ("poses", "covariance"):
+                wiring.connect(f"estimator.{name}", f"viewer.{name}")
+        for k, name in enumerate(self._names):
+            if self._has_truth:
+                wiring.connect(f"truth.{name}.pose", f"viewer.truth_{k}")
+        if not scenario.world.arena.walls:  # else all that matters is between them
+            meshcat.SetCameraPose(*_view(np.vstack([scenario.places(), scenario.destination])))
 
     def outcome(self, context: Context) -> str | None:
         """Returns how the planner says that the formation fares, once it is at an end."""
@@ -162,4 +192,16 @@ class FormationMission(Mission):
         (out / "moves.json").write_text(json.dumps(moves, indent=1) + "\n")
 
 
+def _view(places: Array) -> tuple[Array, Array]:
+    """Returns a place to the south of places (n, 2) and above, and their middle, (3,) m each."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    middle, (wide, deep) = (low + high) / 2, high - low
+    distance = max(2.0, 0.55 * wide, 0.9 * deep)  # windows are wider than high
+    eye = [middle[0], middle[1] - 0.6 * distance, 0.8 * distance]
+    return np.array(eye), np.array([*middle, 0.0])
+
+
+_FRAME_RATE = (
+    10.0  # Hz: runs are long and robots slow; twice as many make the replay twice as large
+)
 _LOG_RATE = 5.0  # Hz: moves take half a minute

@@ -43,6 +43,7 @@ class Wiring:
         world: what stands around the robots.
         robots: by name.
         meshcat: where it is shown, if anywhere.
+        frame_rate: at which Meshcat's bodies are moved, Hz; the replay glides in between.
     """
 
     def __init__(
@@ -52,6 +53,7 @@ class Wiring:
         world: World,
         robots: dict[str, RobotParameters],
         meshcat: Meshcat | None,
+        frame_rate: float = FRAME_RATE,
     ) -> None:
         self.builder = DiagramBuilder()
         self._scenario = scenario
@@ -74,7 +76,7 @@ class Wiring:
         self._watched: dict[str, OutputPort] = {}  # to look one up by name takes a millisecond
         if meshcat is not None:
             parameters = MeshcatVisualizerParams(
-                publish_period=1 / FRAME_RATE, role=Role.kIllustration, prefix="scene"
+                publish_period=1 / frame_rate, role=Role.kIllustration, prefix="scene"
             )
             visualizer = MeshcatVisualizer(meshcat, parameters)
             visualizer.set_name("meshcat")

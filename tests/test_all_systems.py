@@ -44,6 +44,7 @@ from ruamel.yaml import YAML
 import diagrams
 import plants
 import systems
+from diagrams.formation_viewer import FormationViewer
 from diagrams.shell_viewer import ShellViewer
 from diagrams.surroundings_viewer import SurroundingsViewer
 from diagrams.viewer import EstimateViewer
@@ -71,6 +72,7 @@ from systems.avoiders.sector import SectorAvoider
 from systems.avoiders.vfh_plus import VfhPlus
 from systems.cameras import PinholeCamera
 from systems.controllers.collision_monitor import CollisionMonitor
+from systems.controllers.formation_cameras import FormationCameras
 from systems.controllers.search import SearchWhenLost
 from systems.controllers.shell_route import Leg, ShellRoute
 from systems.controllers.triangle_algorithm1 import TriangleAlgorithm1
@@ -432,6 +434,10 @@ CASES: dict[type, Callable[[Path], Case]] = {
     DwaAvoider: lambda _: avoider(DwaAvoider),
     EstimateViewer: viewer,
     Failure: lambda _: Case(Failure(robots=4, robot=1, at=0.1), {}),
+    FormationCameras: lambda _: Case(
+        FormationCameras(robots=1, cameras=["front_camera"]),
+        {"looking": vector(0.0), "robot0_front_camera": (detections(0.0), detections(0.01, 3.0))},
+    ),
     FormationTurns: lambda _: Case(
         FormationTurns(start_poses=[[0.75, 0, 0], [0, 1.3, 0], [2.25, 0, 0], [1.5, 1.3, 0]]),
         {
@@ -440,6 +446,23 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "failed": vector(0.0, 0.0, 0.0, 0.0),
             **{f"status_{k}": vector(0.0, 0.0) for k in range(4)},
         },
+    ),
+    FormationViewer: lambda _: Case(
+        FormationViewer(
+            meshcat=Meshcat(MeshcatParams(host="localhost")),
+            robots=4,
+            destination=np.zeros(2),
+            rate=10.0,
+        ),
+        {
+            "move": (FormationMove(), FormationMove(stamp=0.0, status="reached", number=1)),
+            "moving": vector(0.0, 1.0, 0.0, 0.0),
+            "record": vector(*np.zeros(8)),
+            "positions": vector(*range(8)),
+            "poses": vector(*range(12)),
+            "covariance": vector(*(1e-4 * np.eye(12).ravel())),
+        }
+        | {f"truth_{k}": vector(0.0, float(k), 0.1) for k in range(4)},
     ),
     FormationFilter: lambda _: Case(
         FormationFilter(start_poses=[[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]], camera=CAMERA),
