@@ -143,8 +143,7 @@ def nees_mean(log: FormationLog) -> float | None:
         return None
     values = []
     for k in log.ends():
-        # The estimate of the robot that moved comes with the look after the move.
-        k = min(int(k) + _LOOKED, len(log.t) - 1)
+        k = looked(log, k)
         error = log.estimate[k] - log.truth[k]
         error[:, 2] = wrap(error[:, 2])
         e = error.ravel()
@@ -152,4 +151,15 @@ def nees_mean(log: FormationLog) -> float | None:
     return float(np.mean(values))
 
 
-_LOOKED = 5  # samples: a second at 5 Hz
+def looked(log: FormationLog, end: np.intp) -> int:
+    """Returns the sample a second after a move has ended: then all have looked at each other.
+
+    Args:
+        log: truth, belief and moves.
+        end: sample at which the move had ended.
+    """
+    after = np.searchsorted(log.t, log.t[end] + _LOOK - 1e-9)
+    return int(min(after, len(log.t) - 1))
+
+
+_LOOK = 1.0  # s
