@@ -7,7 +7,7 @@ Equilateral Triangular Formations".
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -66,7 +66,7 @@ class FormationScenario(Scenario):
         estimator: finds where all robots are: a block with the ports moving, robot{k}_{camera},
             poses, covariance; or `none`: every robot is believed to stand where it was to go.
         planner: which robot moves where: `closest`, the paper's rule, or `astar`.
-        step: how a robot behaves in a step.
+        step: how a robot behaves in a step; its side is the formation's.
         turns: how long things take.
         fail_robot: number of the robot that fails, from 1; none if left out.
         fail_at: when it does, s.
@@ -115,6 +115,10 @@ class FormationScenario(Scenario):
         )
         side = self.formation.side
         require_positive(side=side)
+        left_out = FormationStepParameters().side
+        same = self.step.side in (left_out, side)
+        require(same, "step.side", self.step.side, f"formation.side, {side:g}; best left out")
+        self.step = replace(self.step, side=side)
         try:
             fit_lattice(self.places(), side)
         except ValueError as error:

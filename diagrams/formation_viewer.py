@@ -32,6 +32,7 @@ _DASH = 0.15  # m, a dash with the gap after it
 _MAGNIFIED = 10.0  # times, of the larger one of a robot's two ellipses
 _LARGEST = 0.75  # m, semi-axis of an ellipse that is still drawn
 _SMALLEST = 0.004  # m, that one still sees
+_FLOOR = 0.006  # m, height of what is drawn on the ground
 _ABOVE = 0.30  # m; estimates float over the robots, which would hide them
 _LIGHTS = (
     ("AmbientLight", "intensity", 2.8),
@@ -348,7 +349,8 @@ class FormationViewer(LeafSystem):
         if outcome > 0:
             name = f"{_ROOT}/built/{self._ended}"
             for k, beacon in enumerate((int(one), int(two))):
-                self._line(f"{name}/{k}", positions[beacon], np.array(target), 0.012, _WHITE)
+                ends = positions[beacon], np.array(target)
+                self._line(f"{name}/{k}", *ends, 0.012, _WHITE, height=0.003)
             self._appear(name, t)
 
     def _mark(self, way: str, place: Array, t: float) -> None:
@@ -368,16 +370,24 @@ class FormationViewer(LeafSystem):
             self._put(name, Box(0.06, 0.06, 0.003), _RED, place)
         self._appear(name, t)
 
-    def _line(self, name: str, a: Array, b: Array, width: float, colour: Rgba) -> None:
+    def _line(
+        self, name: str, a: Array, b: Array, width: float, colour: Rgba, height: float = _FLOOR
+    ) -> None:
         way = b - a
         shape = Box(float(np.hypot(*way)) + 1e-6, width, 0.004)
-        self._put(name, shape, colour, (a + b) / 2, math.atan2(way[1], way[0]))
+        self._put(name, shape, colour, (a + b) / 2, math.atan2(way[1], way[0]), height)
 
     def _put(
-        self, name: str, shape: Shape, colour: Rgba, place: Array, heading: float = 0.0
+        self,
+        name: str,
+        shape: Shape,
+        colour: Rgba,
+        place: Array,
+        heading: float = 0.0,
+        height: float = _FLOOR,
     ) -> None:
         self._meshcat.SetObject(name, shape, colour)
-        X = RigidTransform(RollPitchYaw(0.0, 0.0, heading), [place[0], place[1], 0.006])
+        X = RigidTransform(RollPitchYaw(0.0, 0.0, heading), [place[0], place[1], height])
         self._meshcat.SetTransform(name, X)
 
     def _appear(self, name: str, t: float) -> None:

@@ -56,4 +56,8 @@ STUDIES = {
         "Error of triangles and of dead reckoning at the destination, beside the paper's table 1",
         "diagrams.formation_studies:table1_findings",
     ),
+    "formation_side": ModelStudy(
+        "Side length of a formation's triangles against their errors, number of moves and time",
+        "diagrams.formation_sides:formation_side",
+    ),
 }
