@@ -127,6 +127,7 @@ from systems.planners.formation_planner import FormationMove, FormationPlanner
 from systems.planners.formation_turns import FormationTurns
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor
+from systems.planners.sonar_obstacles import SonarObstacles
 from systems.planners.waypoint_sequencer import WaypointSequencer
 from systems.pose_vector import PoseFromVector, PoseToVector
 from systems.sensors.drawn_camera import DrawnCamera
@@ -663,6 +664,21 @@ CASES: dict[type, Callable[[Path], Case]] = {
         {"command": vector(0.2, 0.1), "covariance": vector(*(0.01 * np.eye(3).ravel()))},
     ),
     SectorAvoider: lambda _: avoider(SectorAvoider),
+    SonarObstacles: lambda _: Case(
+        SonarObstacles(robots=2),
+        {
+            "poses": vector(0.0, 0.0, 0.0, 1.5, 0.0, 1.0),
+            "covariance": vector(*(1e-6 * np.eye(6)).ravel()),
+            "moving": vector(0.0, 0.0),
+            **{
+                f"scan_{k}": (
+                    Scan(stamp=0.0, range_max=2.6, ranges=np.full(24, 1.0 + k)),
+                    Scan(stamp=0.0, range_max=2.6, ranges=np.full(24, 2.0 + k)),
+                )
+                for k in range(2)
+            },
+        },
+    ),
     SphereFlow: lambda _: Case(
         SphereFlow(estimator=SphereFlowEstimator(view=VIEW)),
         {"matches": (matches(1.0, 1e-4), matches(2.0, 2e-4))},
