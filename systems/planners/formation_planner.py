@@ -129,8 +129,9 @@ def after(
     """Returns what a planner keeps, and says, after a look.
 
     A move goes on until it is done or given up, the mover or one of its beacons fails, or an
-    obstacle turns up in the rest of its way. Then, and when a formation that stands is told of
-    another destination, obstacle or failure, the next move is planned.
+    obstacle turns up in the rest of its way or between its target and a beacon. Then, and when a
+    formation that stands is told of another destination, obstacle or failure, the next move is
+    planned.
     """
     vertices, wrecks, given_up = dict(memory.vertices), dict(memory.wrecks), memory.given_up
     move = memory.move
@@ -189,7 +190,12 @@ def _is_cut(move: FormationMove, report: Report, parameters: FormationParameters
     rest = np.concatenate([position[None], rest_of(move.points, position)])
     # Planned with the whole safety zone, given up at half of it: noise must not turn robots back.
     room = parameters.robot_radius + parameters.safety / 2
-    return any(clearance(report.obstacles, a, b) < room for a, b in pairwise(rest))
+    if any(clearance(report.obstacles, a, b) < room for a, b in pairwise(rest)):
+        return True
+    beacons = report.positions[move.beacons]
+    seen = (b for b in beacons if np.isfinite(b).all())
+    margin = parameters.sight_margin / 2
+    return any(clearance(report.obstacles, move.target, b) < margin for b in seen)
 
 
 def _is_broken(

@@ -71,6 +71,7 @@ class FormationTurns(LeafSystem):
         - looking
         - progress
         - positions
+        - believed
         - record
         - health
 
@@ -92,8 +93,10 @@ class FormationTurns(LeafSystem):
         looking (output, vector of N): 1 for each robot whose cameras are needed: the mover's while
             it moves, everybody's while all stand and look.
         progress (output, vector of 2): number of the move, and 1 when it is done, -1 when it was
-            given up (its controller waits for too long, or the robot has failed), else 0.
+            given up (its controller waits for too long, the robot has failed, or the planner has
+            something else in mind), else 0.
         positions (output, vector of 2 N): x, y of the robots as they are believed to be.
+        believed (output, vector of 3 N): [x, y, theta] of the robots, likewise.
         record (output, vector of 8): number of the last move that ended, its robot, its three
             beacons, its target (2, m) and what became of it (1 or -1); zeros before the first.
         health (output, Health): `bad_pose`, looks at estimates that were not finite, for which
@@ -163,6 +166,7 @@ class FormationTurns(LeafSystem):
             ),
             {self.discrete_state_ticket(self._belief)},
         )
+        self._believed_output = self.DeclareStateOutputPort("believed", self._belief)
         self._record_output = self.DeclareStateOutputPort("record", self._record)
         self._counts = Counts(self, "bad_pose", "given_up")
 
@@ -201,6 +205,10 @@ class FormationTurns(LeafSystem):
     def positions_output_port(self) -> OutputPort:
         """Returns the port of the believed positions."""
         return self._positions_output
+
+    def believed_output_port(self) -> OutputPort:
+        """Returns the port of the believed poses."""
+        return self._believed_output
 
     def record_output_port(self) -> OutputPort:
         """Returns the port of the last move that ended."""
@@ -253,6 +261,8 @@ class FormationTurns(LeafSystem):
         elif phase == Phase.READY:
             if move.status == "moving" and move.number > number and move.mover >= 0:
                 number, mover, outcome, after = move.number, move.mover, 0.0, Phase.START
+        elif phase == Phase.START and (move.number != number or move.status != "moving"):
+            outcome, after = -1.0, Phase.LOOK  # it has not moved yet, and is looked at again
         elif phase == Phase.START and waited >= p.start_time:
             robot = int(mover)
             task = StepTask(
@@ -261,7 +271,8 @@ class FormationTurns(LeafSystem):
             discrete_state.set_value(self._task, task.vector())
             after = Phase.DRIVE
         elif phase == Phase.DRIVE:
-            outcome = self._outcome(context, int(mover), number, waited)
+            outcome = -1.0 if move.number != number or move.status != "moving" else 0.0
+            outcome = outcome or self._outcome(context, int(mover), number, waited)
             if outcome:
                 after = Phase.STOP
         elif phase == Phase.STOP and waited >= p.stop_time:
