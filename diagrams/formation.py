@@ -9,14 +9,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 
 from diagrams.formation_mission import FormationMission
+from diagrams.formation_sensing import ring_of
 from diagrams.mission import Mission
+from diagrams.random_formation import CLUTTER
+from diagrams.random_world import RandomWorld
 from diagrams.scenario import Scenario
 from diagrams.station import Hardware, RobotParameters, Start
 from diagrams.tables import Choice, Table
@@ -26,6 +29,7 @@ from systems.controllers.formation_step import FormationStepParameters
 from systems.planners.formation_lattice import fit_lattice, strip
 from systems.planners.formation_moves import FormationParameters
 from systems.planners.formation_turns import FormationTurnsParameters
+from systems.planners.sonar_grid import SonarGridParameters
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -66,11 +70,16 @@ class FormationScenario(Scenario):
         estimator: finds where all robots are: a block with the ports moving, robot{k}_{camera},
             poses, covariance; or `none`: every robot is believed to stand where it was to go.
         planner: which robot moves where: `closest`, the paper's rule, or `astar`.
+        obstacles: `known` from the start, all that stand in the world, or `sensed`: what the rings
+            of ultrasonic range finders of all robots have heard, which takes one among the sensors.
+        sonar: how what they hear is put together.
         step: how a robot behaves in a step; its side is the formation's.
         turns: how long things take.
         fail_robot: number of the robot that fails, from 1; none if left out.
         fail_at: when it does, s.
     """
+
+    random_world: ClassVar[RandomWorld] = CLUTTER
 
     world: WorldParameters
     robot: Hardware
@@ -82,6 +91,8 @@ class FormationScenario(Scenario):
     controller: Annotated[Choice, CONTROLLERS]
     estimator: Annotated[Choice | None, ESTIMATORS] = None
     planner: Literal["closest", "astar"] = "closest"
+    obstacles: Literal["known", "sensed"] = "known"
+    sonar: SonarGridParameters = field(default_factory=SonarGridParameters)
     step: FormationStepParameters = field(default_factory=FormationStepParameters)
     turns: FormationTurnsParameters = field(default_factory=FormationTurnsParameters)
     fail_robot: int | None = None
@@ -106,6 +117,8 @@ class FormationScenario(Scenario):
             )
         ring = getattr(self.robot.body.build(), "ring", None)
         require(ring is not None, "robot.body.ring", ring, "markers for the others to see")
+        if self.obstacles == "sensed":
+            ring_of(self.robot)
         fails = self.fail_robot
         require(
             fails is None or 1 <= fails <= self.robots,

@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
-from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
+from pydrake.systems.primitives import ConstantVectorSource
 
 from diagrams.formation_metrics import FormationLog, formation_metrics
+from diagrams.formation_sensing import add_obstacles, obstacle_metrics, touched
 from diagrams.formation_summary import plot_formation
 from diagrams.formation_viewer import FormationViewer
 from diagrams.mission import Mission, Wiring
 from diagrams.trajectories import write_tum
-from plants.formation_arena import known_obstacles
 from systems.controllers.formation_cameras import FormationCameras
 from systems.planners.failure import Failure
 from systems.planners.formation_planner import FormationPlanner
@@ -50,6 +49,8 @@ class FormationMission(Mission):
         self._scenario = scenario
         self._wiring = wiring
         self._names = scenario.names()
+        # What is heard may still turn out to be less than it seemed.
+        self._hope = _HOPE if scenario.obstacles == "sensed" else 0.0
         self._add_blocks()
         self._connect()
         self._has_truth = wiring.has_output(f"truth.{self._names[0]}.pose")
@@ -79,8 +80,6 @@ class FormationMission(Mission):
         fails = None if scenario.fail_robot is None else scenario.fail_robot - 1
         wiring.add(Failure(robots=scenario.robots, robot=fails, at=scenario.fail_at), "failure")
         wiring.add(ConstantVectorSource(scenario.destination), "destination")
-        obstacles = known_obstacles(scenario.world.arena)
-        wiring.add(ConstantValueSource(AbstractValue.Make(obstacles)), "obstacles")
         wiring.add(FormationCameras(robots=scenario.robots, cameras=CAMERAS), "cameras")
 
     def _connect(self) -> None:
@@ -108,10 +107,12 @@ class FormationMission(Mission):
         for block in ("turns", "planner"):
             wiring.connect("failure.failed", f"{block}.failed")
         wiring.connect("destination.y0", "planner.destination")
-        wiring.connect("obstacles.y0", "planner.obstacles")
+        wiring.connect(add_obstacles(wiring, self._scenario), "planner.obstacles")
 
     def _log(self) -> None:
-        names = ["turns.record", "turns.positions", *(f"truth.{name}.pose" for name in self._names)]
+        kinds = ("pose", "contacts", "clearance")
+        truth = [f"truth.{name}.{kind}" for name in self._names for kind in kinds]
+        names = ["turns.record", "turns.positions", *truth]
         for name in [*names, "estimator.poses", "estimator.covariance"]:
             if self._wiring.has_output(name):
                 self._wiring.log(name, _LOG_RATE)
@@ -138,10 +139,21 @@ class FormationMission(Mission):
             meshcat.SetCameraPose(*_view(np.vstack([scenario.places(), scenario.destination])))
 
     def outcome(self, context: Context) -> str | None:
-        """Returns how the planner says that the formation fares, once it is at an end."""
+        """Returns how the planner says that the formation fares, once it is at an end.
+
+        A run in which a robot touched an obstacle ends as `contact`, wherever it got to.
+        """
         move = self._wiring.value("planner.move", context)
         ends = ("reached", "blocked", "broken", "too_few_robots")
-        return str(move.status) if move.status in ends else None
+        if move.status not in ends:
+            return None
+        if move.status == "blocked" and context.get_time() < move.stamp + self._hope:
+            return None
+        return self.unfinished(context, str(move.status))
+
+    def unfinished(self, context: Context, word: str) -> str:
+        """Returns `contact` for a run in which a robot touched an obstacle."""
+        return "contact" if touched(self._wiring, self._names, context) else word
 
     def succeeded(self, outcome: str) -> bool:
         """Whether the destination was reached."""
@@ -149,7 +161,8 @@ class FormationMission(Mission):
 
     def metrics(self, context: Context) -> dict[str, Any]:
         """Returns the metrics (see `diagrams.formation_metrics`)."""
-        return formation_metrics(self.formation_log(context), self._scenario.formation.side)
+        metrics = formation_metrics(self.formation_log(context), self._scenario.formation.side)
+        return metrics | obstacle_metrics(self, self._names, context)
 
     def formation_log(self, context: Context) -> FormationLog:
         """Returns truth, belief and moves over time."""
@@ -205,3 +218,4 @@ _FRAME_RATE = (
     10.0  # Hz: runs are long and robots slow; twice as many make the replay twice as large
 )
 _LOG_RATE = 5.0  # Hz: moves take half a minute
+_HOPE = 5.0  # s, for which the way must be blocked

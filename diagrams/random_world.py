@@ -9,12 +9,15 @@ is saved with a run is an ordinary one, and stays as it is whatever later versio
 
 Who asks for a random world does away with the world, waypoints and start of the scenario that is
 extended; those given in the same layer, or a later one, are laid over what was drawn.
+
+Other missions draw other worlds, under the same key: see `diagrams.random_formation`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,12 +27,20 @@ from plants.random_arena import RandomArena, RandomArenaParameters, random_arena
 from systems.markers.layout import MarkerMap
 
 _RANDOM: Key = ("world", "random")
-_DRAWN: tuple[Key, ...] = (
-    ("world", "markers"),
-    ("world", "arena"),
-    ("waypoints",),
-    ("robot", "start"),
-)
+
+
+@dataclass(frozen=True)
+class RandomWorld:
+    """A kind of world that comes from the seed.
+
+    Attributes:
+        keys: what is drawn.
+        draw: makes plain data with those keys of the seed, plain data of the scenario with
+            `world.random`, and the place of its top; raises `ScenarioError`.
+    """
+
+    keys: tuple[Key, ...]
+    draw: Callable[[int, Mapping[str, Any], Place], dict[str, Any]]
 
 
 def asks_for_random(data: Mapping[str, Any]) -> bool:
@@ -38,22 +49,25 @@ def asks_for_random(data: Mapping[str, Any]) -> bool:
     return isinstance(world, Mapping) and world.get("random") is not None
 
 
-def make_way(base: dict[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+def make_way(
+    base: dict[str, Any], top: Mapping[str, Any], kind: Callable[[], RandomWorld]
+) -> dict[str, Any]:
     """Returns `base` without what is to be drawn, if `top`, laid over it, is first to ask for it.
 
     Args:
         base: plain data of the layers below.
         top: plain data of the layer.
+        kind: says which kind of world the mission has.
     """
     if not asks_for_random(top) or asks_for_random(base):
         return base
-    for key in _DRAWN:
+    for key in kind().keys:
         base = _without(base, key)
     return base
 
 
 def draw_world(
-    data: Mapping[str, Any], known: Mapping[str, Any], place: Place
+    data: Mapping[str, Any], known: Mapping[str, Any], place: Place, kind: RandomWorld
 ) -> tuple[dict[str, Any], Place]:
     """Returns plain data in which a room stands for `world.random`, and the place of the top.
 
@@ -61,21 +75,17 @@ def draw_world(
         data: of the whole scenario.
         known: keys that the scenario's mission has; no others are added.
         place: of the top; what is drawn is said to come from where `world.random` was written.
+        kind: of world.
 
     Raises:
         ScenarioError: a parameter is refused, or there is no such room.
     """
     at = place / "world" / "random"
-    parameters = convert(data["world"]["random"], RandomArenaParameters, at)
     seed = convert(data.get("seed", 0), int, place / "seed")
-    try:
-        room = random_arena(seed, parameters)
-    except ValueError as error:
-        raise at.error(f"{at}: {error}") from error
-    drawn = _plain(room)
+    drawn = kind.draw(seed, data, place)
     given = _without(dict(data), _RANDOM)
     origins = dict(place.origins)
-    for key in _DRAWN:
+    for key in kind.keys:
         if key[0] not in known:
             drawn = _without(drawn, key)
         elif not _has(given, key):
@@ -85,6 +95,15 @@ def draw_world(
     return _over(drawn, given), Place(origins=origins, folders=place.folders)
 
 
+def _draw_room(seed: int, data: Mapping[str, Any], place: Place) -> dict[str, Any]:
+    at = place / "world" / "random"
+    parameters = convert(data["world"]["random"], RandomArenaParameters, at)
+    try:
+        return _plain(random_arena(seed, parameters))
+    except ValueError as error:
+        raise at.error(f"{at}: {error}") from error
+
+
 def _plain(room: RandomArena) -> dict[str, Any]:
     x, y, theta = room.start
     return {
@@ -92,6 +111,12 @@ def _plain(room: RandomArena) -> dict[str, Any]:
         "robot": {"start": {"x": float(x), "y": float(y), "heading_deg": _degrees(theta)}},
         "waypoints": room.waypoints.tolist(),
     }
+
+
+ROOM = RandomWorld(
+    keys=(("world", "markers"), ("world", "arena"), ("waypoints",), ("robot", "start")),
+    draw=_draw_room,
+)
 
 
 def plain_markers(markers: MarkerMap) -> dict[str, Any]:

@@ -12,11 +12,11 @@ import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 from ruamel.yaml import YAML, YAMLError
 
-from diagrams.random_world import asks_for_random, draw_world, make_way
+from diagrams.random_world import ROOM, RandomWorld, asks_for_random, draw_world, make_way
 from diagrams.schema import (
     OVERRIDE,
     Existing,
@@ -73,7 +73,10 @@ class Scenario:
             with pixel noise (hundreds of times faster than a picture).
         recording: a recording whose sensors are played back instead of simulated ones.
         record: what the run writes.
+        random_world: which kind of world comes from the seed, of all scenarios of the class.
     """
+
+    random_world: ClassVar[RandomWorld] = ROOM
 
     mission: str
     name: str = ""
@@ -180,7 +183,7 @@ def check(layers: Layers) -> Any:
     name, target = MISSIONS.target(mission, place / "mission")
     data = layers.data | {"mission": name}
     if asks_for_random(data):
-        data, place = draw_world(data, field_hints(target), place)
+        data, place = draw_world(data, field_hints(target), place, target.random_world)
     return convert(data, target, place)
 
 
@@ -220,9 +223,20 @@ def read_layers(path: Path, seen: tuple[Path, ...] = ()) -> Layers:
     origins: dict[Key, str] = {(): str(path)}
     _note_lines(content, (), str(path), origins)
     top = to_plain(content)
-    layers.data = merge(make_way(layers.data, top), top)
+    below = make_way(layers.data, top, lambda: _random_world(layers.data | top, layers.place()))
+    layers.data = merge(below, top)
     layers.origins |= origins
     return layers
+
+
+def _random_world(data: Mapping[str, Any], place: Place) -> RandomWorld:
+    """Returns what kind of random world the mission of some layers has."""
+    try:
+        mission = convert(data.get("mission"), str, place / "mission")
+        kind: RandomWorld = MISSIONS.target(mission, place / "mission")[1].random_world
+    except ScenarioError:  # said when all layers are there
+        return ROOM
+    return kind
 
 
 def merge(base: Any, top: Any) -> Any:
@@ -323,7 +337,8 @@ def set_value(layers: Layers, dotted: str, value: Any) -> None:
     top = value
     for step in reversed(steps):
         top = {str(step): top}
-    layers.data = _set_in(make_way(layers.data, top), steps, value, text)
+    below = make_way(layers.data, top, lambda: _random_world(layers.data | top, layers.place()))
+    layers.data = _set_in(below, steps, value, text)
 
 
 def _set_in(data: Any, steps: list[str | int], value: Any, what: str) -> Any:

@@ -66,6 +66,7 @@ SENSORS = Table(
         "lidar": "diagrams.drivers.lidar:Lidar",
         "mpu6050": "diagrams.drivers.imu:Mpu6050",
         "shell_camera": "diagrams.drivers.shell_camera:ShellCamera",
+        "ultrasonic": "diagrams.drivers.ultrasonic:UltrasonicDriver",
         "wheel_encoders": "diagrams.drivers.encoders:Encoders",
     },
     method="add",
