@@ -245,6 +245,20 @@ def test_what_turns_up_in_the_way_turns_the_robot_back() -> None:
     assert np.hypot(*(again.target - move.target)) > 1.0
 
 
+def test_what_turns_up_before_a_beacon_turns_the_robot_back() -> None:
+    """A post beside the way, in the line of sight from the target to the anchor or to another."""
+    for beacon in range(3):
+        world = World(strip(4, 1.5), rule="closest")
+        move = world.look()
+        world.drive(part=0.3)
+        stands = world.places[move.beacons[beacon]]
+        post = stands + 0.2 * (move.target - stands)
+        away = clearance(Obstacles(circles=np.array([[*post, 0.02]])), *move.points[-2:])
+        assert away > PARAMETERS.room or beacon == 2  # it is not in the way itself
+        world.obstacles = Obstacles(stamp=1.0, circles=np.array([[*post, 0.02]]))
+        assert world.look() is not move
+
+
 def test_a_block_that_goes_away_lets_them_go_on() -> None:
     ring = np.array([[1.1 + 3.0 * math.cos(a), 0.65 + 3.0 * math.sin(a), 0.6] for a in range(63)])
     world = World(strip(4, 1.5), obstacles=Obstacles(stamp=0.0, circles=ring))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -116,6 +117,46 @@ def test_without_an_estimate_the_robot_is_believed_to_be_where_it_was_to_go() ->
     expected = START[:, :2].copy()
     expected[1] = TARGET
     np.testing.assert_allclose(rig.output("positions").reshape(4, 2), expected)
+
+
+@pytest.mark.parametrize("instead", ["moving", "blocked"])
+def test_a_robot_whose_move_is_planned_anew_stops_first(instead: str) -> None:
+    rig = driving(Rig())
+    other = dataclasses.replace(MOVE, number=2, mover=1, beacons=np.array([3, 0, 2]))
+    rig.move(other if instead == "moving" else FormationMove(stamp=2.0, status=instead, number=1))
+    rig.wait(0.1)
+    assert rig.task(1).number == 0
+    assert rig.output("moving")[1] == 1  # until it stands for sure
+    rig.wait(0.6)
+    np.testing.assert_array_equal(rig.output("looking"), [1, 1, 1, 1])
+    rig.wait(0.8)
+    assert rig.output("record")[-1] == -1  # not done: nobody is believed to stand at the target
+    np.testing.assert_allclose(rig.output("positions").reshape(4, 2), START[:, :2])
+    rig.wait(1.0)
+    assert rig.task(1).number == (2 if instead == "moving" else 0)
+
+
+def test_a_move_that_is_planned_anew_before_it_begins_is_none() -> None:
+    rig = Rig()
+    rig.move(MOVE)
+    while not rig.output("moving")[1]:
+        rig.wait(0.1)
+    rig.move(dataclasses.replace(MOVE, number=2, mover=0, beacons=np.array([1, 2, 3])))
+    rig.wait(0.1)
+    np.testing.assert_array_equal(rig.output("moving"), np.zeros(4))
+    rig.wait(1.0)
+    assert rig.output("record")[0] == 0
+    rig.wait(0.6)
+    assert [rig.task(k).number for k in range(4)] == [2, 0, 0, 0]
+
+
+def test_the_believed_poses_are_those_of_the_positions() -> None:
+    rig = driving(Rig(estimate=True))
+    told = START + 0.01
+    rig.block.poses_input_port().FixValue(rig.context, told.ravel())
+    rig.wait(0.2)
+    np.testing.assert_allclose(rig.output("believed").reshape(4, 3), told)
+    np.testing.assert_allclose(rig.output("positions").reshape(4, 2), told[:, :2])
 
 
 def test_with_one_it_is_believed() -> None:
