@@ -13,7 +13,12 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource
 
 from diagrams.formation_metrics import FormationLog, formation_metrics
-from diagrams.formation_sensing import add_obstacles, obstacle_metrics, touched
+from diagrams.formation_sensing import (
+    add_obstacles,
+    obstacle_metrics,
+    sensed_obstacles,
+    touched,
+)
 from diagrams.formation_summary import plot_formation
 from diagrams.formation_viewer import FormationViewer
 from diagrams.mission import Mission, Wiring
@@ -201,6 +206,7 @@ class FormationMission(Mission):
                 arena=self._scenario.world.arena,
                 destination=self._scenario.destination,
                 side=self._scenario.formation.side,
+                sensed=sensed_obstacles(self._wiring, context),
             )
         (out / "moves.json").write_text(json.dumps(moves, indent=1) + "\n")
 

@@ -12,11 +12,14 @@ from pydrake.systems.primitives import ConstantValueSource
 from diagrams.mission import Mission, Wiring
 from diagrams.station import Hardware
 from plants.formation_arena import known_obstacles
+from systems.planners.formation_obstacles import Obstacles
 from systems.planners.sonar_obstacles import SonarObstacles, SonarTrustParameters
 from systems.validation import require
 
 if TYPE_CHECKING:
     from diagrams.formation import FormationScenario
+
+_SENSED = "obstacles.obstacles"
 
 
 def ring_of(robot: Hardware) -> str:
@@ -68,7 +71,15 @@ def add_obstacles(wiring: Wiring, scenario: FormationScenario) -> str:
     wiring.connect("turns.moving", "obstacles.moving")
     if wiring.has_block("estimator"):
         wiring.connect("estimator.covariance", "obstacles.covariance")
-    return "obstacles.obstacles"
+    return _SENSED
+
+
+def sensed_obstacles(wiring: Wiring, context: Context) -> Obstacles | None:
+    """Returns what the robots have heard so far; None if they need not listen."""
+    if not wiring.has_output(_SENSED):
+        return None
+    heard: Obstacles = wiring.value(_SENSED, context)
+    return heard
 
 
 def touched(wiring: Wiring, robots: list[str], context: Context) -> bool:

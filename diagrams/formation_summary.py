@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from matplotlib.ticker import MaxNLocator
@@ -19,6 +20,7 @@ from diagrams.formation_metrics import FormationLog, MoveEnd, looked
 from diagrams.plots import draw_arena
 from diagrams.viewer import ellipse
 from plants.arena import ArenaParameters
+from systems.planners.formation_obstacles import Obstacles
 
 Array = NDArray[np.float64]
 
@@ -28,15 +30,26 @@ _MAGNIFIED = 10.0
 
 
 def plot_formation(
-    path: Path, log: FormationLog, *, arena: ArenaParameters, destination: list[float], side: float
+    path: Path,
+    log: FormationLog,
+    *,
+    arena: ArenaParameters,
+    destination: list[float],
+    side: float,
+    sensed: Obstacles | None = None,
 ) -> None:
     """Writes the figure; see `formation_figure`, `path` is of the PNG."""
-    figure = formation_figure(log, arena=arena, destination=destination, side=side)
+    figure = formation_figure(log, arena=arena, destination=destination, side=side, sensed=sensed)
     figure.savefig(path, dpi=110)
 
 
 def formation_figure(
-    log: FormationLog, *, arena: ArenaParameters, destination: list[float], side: float
+    log: FormationLog,
+    *,
+    arena: ArenaParameters,
+    destination: list[float],
+    side: float,
+    sensed: Obstacles | None = None,
 ) -> Figure:
     """Returns the figure, of the moves that were not given up.
 
@@ -45,13 +58,17 @@ def formation_figure(
         arena: what stands around.
         destination: [x, y] m.
         side: nominal, of the triangles, m.
+        sensed: what the robots took for obstacles at the end, if they had to sense them.
     """
     figure = Figure(figsize=(14, 9), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 3, height_ratios=[1.4, 1.0])
     ended = [(k, move) for k, move in zip(log.ends(), log.moves(), strict=True) if move.done]
     moves = [move for _, move in ended]
-    _plan(figure.add_subplot(grid[0, :]), log, moves, arena, destination)
+    plan = figure.add_subplot(grid[0, :])
+    _plan(plan, log, moves, arena, destination)
+    if sensed is not None:
+        _sensed(plan, sensed)
     below = [figure.add_subplot(grid[1, k]) for k in range(3)]
     _errors(below[0], moves)
     _sides(below[1], moves, side)
@@ -121,6 +138,14 @@ def _believed(ax: Axes, log: FormationLog) -> None:
             label=f"95 %, {_MAGNIFIED:g} times as large" if k == 0 else None,
         )
         ax.add_patch(patch)
+
+
+def _sensed(ax: Axes, sensed: Obstacles) -> None:
+    polygons = PolyCollection(
+        list(sensed.polygons), facecolor="C3", edgecolor="C3", alpha=0.5, label="sensed at the end"
+    )
+    ax.add_collection(polygons)
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), fontsize=9)
 
 
 def _errors(ax: Axes, moves: list[MoveEnd]) -> None:
