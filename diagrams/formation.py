@@ -132,6 +132,13 @@ class FormationScenario(Scenario):
         same = self.step.side in (left_out, side)
         require(same, "step.side", self.step.side, f"formation.side, {side:g}; best left out")
         self.step = replace(self.step, side=side)
+        past = getattr(self.controller.arguments.get("parameters"), "beyond", 0.0)
+        require(
+            self.formation.beyond >= past,
+            "formation.beyond",
+            self.formation.beyond,
+            f"at least {past:g} m, by which the controller drives past its vertex",
+        )
         try:
             fit_lattice(self.places(), side)
         except ValueError as error:

@@ -155,7 +155,7 @@ def _draw_way(
     f: FormationParameters,
 ) -> list[Triangle] | None:
     """Draws the walk of triangles; None when it is too short or meets itself badly."""
-    half = np.array(p.size) / 2 - f.room
+    half = np.array(p.size) / 2 - f.room - f.beyond
     reach = int(np.hypot(*half) / f.side * 2) + 2
     span = np.arange(-reach, reach + 1)
     grid = np.stack(np.meshgrid(span, span, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -223,9 +223,9 @@ def _kept_free(
     lines: set[tuple[tuple[float, float], tuple[float, float], float]] = set()
     for a, b in pairwise(way):
         p, q = sorted(a & b)
-        middle = ((p[0] + q[0]) / 2, (p[1] + q[1]) / 2)
-        ends = sorted(a ^ b)
-        lines |= {(end, middle, f.room) for end in ends}
+        middle = _half(p, q)
+        lines |= {(end, middle, f.room) for end in sorted(a - b)}
+        lines |= {(_past(middle, end, f), middle, f.room) for end in sorted(b - a)}
         lines |= {(x, y, f.sight_margin) for x in sorted(a | b) for y in sorted(a | b) if x < y}
     for a, b, c in zip(way, way[1:], way[2:], strict=False):
         (p, q), (r, s) = sorted(a & b), sorted(b & c)
@@ -239,6 +239,17 @@ def _kept_free(
         headings=np.arctan2(along[:, 1], along[:, 0]),
         sizes=np.stack([lengths, np.zeros_like(lengths)], axis=1),
         radii=[width for _, _, width in ordered],
+    )
+
+
+def _past(
+    middle: tuple[float, float], vertex: Vertex, f: FormationParameters
+) -> tuple[float, float]:
+    """Returns how far the robot goes that settles on a vertex, on the lattice."""
+    share = f.beyond / (math.sqrt(0.75) * f.side)
+    return (
+        vertex[0] + share * (vertex[0] - middle[0]),
+        vertex[1] + share * (vertex[1] - middle[1]),
     )
 
 

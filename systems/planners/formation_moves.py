@@ -47,6 +47,8 @@ class FormationParameters:
         side: of the triangles, m.
         robot_radius: of the circle about a robot's axis that holds it, m.
         safety: zone about obstacles that no robot's circle enters, m.
+        beyond: how far a robot drives past its vertex, straight on, before it backs in, m; that
+            much of the line is to be free too.
         sight_margin: no obstacle may be nearer to the line of sight from the target vertex to a
             beacon, m: half a marker and some.
         arrival: a robot stands this near to the destination when the formation is there, in sides;
@@ -59,6 +61,7 @@ class FormationParameters:
     side: float = 1.5
     robot_radius: float = 0.2
     safety: float = 0.15
+    beyond: float = 0.2
     sight_margin: float = 0.1
     arrival: float = 0.6
     tolerance: float = 0.4
@@ -66,7 +69,7 @@ class FormationParameters:
 
     def __post_init__(self) -> None:
         require_positive(side=self.side, robot_radius=self.robot_radius)
-        require_non_negative(safety=self.safety, sight_margin=self.sight_margin)
+        require_non_negative(safety=self.safety, beyond=self.beyond, sight_margin=self.sight_margin)
         # A path's lines pass beacons, and those pass each other, at sqrt(3)/4 sides.
         room = math.sqrt(3) / 4 * self.side
         least = 2 * self.robot_radius
@@ -109,6 +112,7 @@ class Ground:
         self.around = around
         self._obstacles = obstacles
         self._rooms: dict[tuple[Half, Half], float] = {}
+        self._built: dict[tuple[Half, Half], float] = {}
 
     def place(self, half: Half) -> Array:
         """Returns where a vertex or centre point is, given in half steps: (2,) m."""
@@ -139,15 +143,29 @@ class Ground:
         target = mirrored(r, p, q)
         return (
             self.can_stand(target)
-            and self.can_drive(middle(p, q), corner(target))
+            and self._to_build(middle(p, q), corner(target)) >= self.parameters.room
             and all(self.can_see(target, beacon) for beacon in (p, q, r))
         )
+
+    def _to_build(self, a: Half, b: Half) -> float:
+        """Returns the room on the way from a centre point to a vertex and past it, m."""
+        if (a, b) not in self._built:
+            start, vertex = self.place(a), self.place(b)
+            end = past(start, vertex, self.parameters.beyond)
+            self._built[a, b] = clearance(self._obstacles, start, end)
+        return self._built[a, b]
 
     def _between(self, a: Half, b: Half) -> float:
         key = (a, b) if a <= b else (b, a)
         if key not in self._rooms:
             self._rooms[key] = clearance(self._obstacles, self.place(a), self.place(b))
         return self._rooms[key]
+
+
+def past(start: Array, end: Array, beyond: float) -> Array:
+    """Returns the point that is `beyond` (m) behind the end (2,) of a straight line, (2,) m."""
+    along = end - start
+    return np.asarray(end + along * (beyond / max(float(np.hypot(*along)), 1e-9)))
 
 
 def corner(vertex: Vertex) -> Half:

@@ -26,6 +26,7 @@ from systems.planners.formation_moves import (
     closest_vertex_move,
     formation_of,
     in_reach,
+    past,
 )
 from systems.planners.formation_obstacles import Obstacles, clearance
 from systems.planners.polyline import rest_of
@@ -187,7 +188,9 @@ def _is_cut(move: FormationMove, report: Report, parameters: FormationParameters
     position = report.positions[move.mover]
     if not np.isfinite(position).all():
         return False
-    rest = np.concatenate([position[None], rest_of(move.points, position)])
+    end = past(move.points[-2], move.points[-1], parameters.beyond)
+    points = np.concatenate([move.points[:-1], end[None]])
+    rest = np.concatenate([position[None], rest_of(points, position)])
     # Planned with the whole safety zone, given up at half of it: noise must not turn robots back.
     room = parameters.robot_radius + parameters.safety / 2
     if any(clearance(report.obstacles, a, b) < room for a, b in pairwise(rest)):

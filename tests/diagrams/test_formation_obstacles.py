@@ -162,6 +162,8 @@ def refusal(name: str, *overrides: str) -> str:
         ("world.random.radius=[0.4, 0.1]",
          "world.random.radius is [0.4, 0.1]: must be [least, greatest]"),
         ("formation.side=-1", "formation.side is -1.0: must be greater than 0"),
+        ("controller.beyond=0.3", "formation.beyond is 0.2: must be at least 0.3 m, by which the "
+         "controller drives past its vertex"),
         ("robots=6", "must be places of all 6 robots"),
         ("obstacles=guessed", "obstacles is 'guessed': must be one of known, sensed"),
         ("sonar.miss=-0.1", "sonar.miss is -0.1: must be less than -0.45"),

@@ -45,6 +45,12 @@ def test_the_hidden_way_is_one(seed: int) -> None:
         assert covered.distances_from(triangle).min() >= parameters.room
     for one, two in itertools.pairwise(made.way):
         assert len({tuple(p) for p in np.concatenate([one, two]).round(6)}) == 4  # share a side
+        # Who takes the new corner drives past it before it backs in.
+        near = np.linalg.norm(two[:, None] - one, axis=2).min(axis=1)
+        new = two[near.argmax()]
+        ahead = new - two[near < 0.1].mean(axis=0)
+        past = new + parameters.beyond * ahead / np.linalg.norm(ahead)
+        assert covered.distances_from(past[None]).min() >= parameters.room
     distance = np.linalg.norm(made.destination - made.start.mean(axis=0))
     assert distance >= FormationArenaParameters().distance
 

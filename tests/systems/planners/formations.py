@@ -62,6 +62,8 @@ def check_move(formation: Formation, move: Move, ground: Ground, obstacles: Obst
                 place = lattice.positions(np.array(other))
                 off = clearance(Obstacles(circles=np.array([[*place, 0.0]])), a, b)
                 assert off >= math.sqrt(3) / 4 * p.side - 1e-9, "too near to a beacon"
+    ahead = (target - three) / np.linalg.norm(target - three)
+    assert clearance(obstacles, target, target + p.beyond * ahead) >= p.room
     for beacon in (one, two, three):
         assert clearance(obstacles, target, beacon) >= p.sight_margin
 
@@ -137,7 +139,8 @@ def fewest_moves(
                 continue
             enter = min(middles, key=lambda m: abs(m - mover))
             leave = min(middles, key=lambda m: abs(m - target))
-            legs = [(mover, enter), (enter, leave), (leave, target), (target, target)]
+            past = target + parameters.beyond * (target - leave) / abs(target - leave)
+            legs = [(mover, enter), (enter, leave), (leave, target), (target, past)]
             sights = [(target, beacon) for beacon in beacons]
             if all(free(a, b, room) for a, b in legs) and all(
                 free(a, b, parameters.sight_margin) for a, b in sights

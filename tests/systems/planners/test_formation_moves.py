@@ -120,10 +120,11 @@ def reordered(obstacles: Obstacles, goal: np.ndarray) -> tuple[Formation, np.nda
 
 @pytest.mark.parametrize("gap", [-0.01, 0.01])
 def test_the_safety_zone_is_as_wide_as_said(gap: float) -> None:
-    # Above the last leg to the vertex, which stops there.
-    radius = 0.3
-    y = H + PARAMETERS.room + radius + gap
-    formation, ground = ground_of(START, Obstacles(circles=np.array([[3.0, y, radius]])))
+    # Ahead of the last leg, which goes on past the vertex by as much as the robot does.
+    radius, ahead = 0.3, np.array([math.cos(math.pi / 6), math.sin(math.pi / 6)])
+    away = PARAMETERS.beyond + PARAMETERS.room + radius + gap
+    circle = [*(np.array([3.0, H]) + away * ahead), radius]
+    formation, ground = ground_of(START, Obstacles(circles=np.array([circle])))
     move = closest_vertex_move(formation, np.array([20.0, 0.65]), ground)
     assert move is not None
     assert np.allclose(move.points[-1], [3.0, H]) == (gap > 0)
