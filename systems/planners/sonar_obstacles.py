@@ -295,13 +295,13 @@ class SonarObstacles(LeafSystem):
         counts: Counter[str] = Counter()
         known, stamps = before.known, before.stamps.copy()
         if np.isfinite(poses).all():
-            std = self._deviations(context)
             turned = np.abs(wrap(poses[:, 2] - before.poses[:, 2]))
             turning = turned > self._trust.max_turn_rate * self._dt
-            for k, port in enumerate(self._scan_inputs):
-                scan: Scan = port.Eval(context)
-                if math.isnan(scan.stamp) or scan.stamp == stamps[k]:
-                    continue
+            scans: list[Scan] = [port.Eval(context) for port in self._scan_inputs]
+            new = [k for k, scan in enumerate(scans) if _is_new(scan, stamps[k])]
+            std = self._deviations(context) if new else np.zeros((self._robots, 2))
+            for k in new:
+                scan = scans[k]
                 stamps[k] = scan.stamp
                 fault = scan_fault(scan, context.get_time(), self._trust.max_scan_age)
                 if fault is None and self._is_lost(std[k]):
@@ -370,3 +370,7 @@ class SonarObstacles(LeafSystem):
             return known, "out_of_bounds"
         counts.update(dropped)
         return known, None
+
+
+def _is_new(scan: Scan, last: float) -> bool:
+    return not math.isnan(scan.stamp) and scan.stamp != last
