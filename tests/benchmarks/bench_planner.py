@@ -21,6 +21,13 @@ from systems.planners.astar import AStarParameters, plan, shortest_way
 from systems.planners.cost_map import CostMap, cost_map
 from systems.planners.occupancy import OccupancyParameters, cells_of, empty_grid, with_scan
 from systems.planners.polyline import length_of
+from systems.planners.sonar_grid import (
+    Cones,
+    SonarGridParameters,
+    empty_sonar_grid,
+    rectangles,
+    with_cones,
+)
 from tests.benchmarks.table import Row, show
 
 Array = NDArray[np.float64]
@@ -30,6 +37,7 @@ def rows() -> Iterator[Row]:
     """Yields the measurements."""
     yield from monitor_rows()
     yield mapper_row()
+    yield sonar_row()
     yield from planner_rows()
 
 
@@ -76,6 +84,23 @@ def mapper_row() -> Row:
     ours, theirs = _interleaved(lambda: with_scan(grid, scan, rays, parameters), filled)
     return Row("mapper: a scan of 360 rays, room of 5 m, 120 x 120 cells", f"{ours * 1e3:.2f} ms",
                peers=f"polygon filled by OpenCV: {theirs * 1e3:.2f} ms")  # fmt: skip
+
+
+def sonar_row() -> Row:
+    """One reading of a ring of 24 range finders, half of which hear something."""
+    p = SonarGridParameters()
+    directions = np.linspace(0, 2 * math.pi, 24, endpoint=False)
+    echoes = np.where(np.arange(24) % 2 == 0, 1.8, math.nan)
+    cones = Cones(
+        faces=0.12 * np.stack([np.cos(directions), np.sin(directions)], axis=-1),
+        directions=directions,
+        half_angles=np.full(24, math.radians(7.5)),
+        free=np.where(np.isnan(echoes), 2.6, 1.72),
+        echoes=echoes,
+    )
+    known = empty_sonar_grid(p)
+    (best,) = _interleaved(lambda: rectangles(with_cones(known, cones, 0.0, p), p.max_shapes))
+    return Row("sonar grid: one reading of 24 range finders", f"{best * 1e3:.2f} ms")
 
 
 def planner_rows() -> Iterator[Row]:
