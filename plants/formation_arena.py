@@ -29,7 +29,7 @@ from systems.planners.formation_lattice import (
 )
 from systems.planners.formation_moves import FormationParameters
 from systems.planners.formation_obstacles import Obstacles
-from systems.validation import require, require_positive
+from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
 
@@ -51,6 +51,8 @@ class FormationArenaParameters:
         height: of walls and obstacles, m; above the cameras they hide what is behind them.
         stops: number of places that the hidden way passes before the destination.
         distance: least straight distance from the formation's start to the destination, m.
+        slack: how much wider the hidden way is than the robots need, on either side, m: for those
+            that do not know the obstacles, but only hear about where they are.
     """
 
     size: list[float] = field(default_factory=lambda: [18.0, 14.0])
@@ -61,6 +63,7 @@ class FormationArenaParameters:
     height: float = 0.5
     stops: int = 2
     distance: float = 8.0
+    slack: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("size", "box_side", "radius"):
@@ -74,6 +77,7 @@ class FormationArenaParameters:
         require(0 <= self.cylinder_share <= 1, "cylinder_share", self.cylinder_share, "0 to 1")
         require(self.stops >= 0, "stops", self.stops, "0 or greater")
         require_positive(height=self.height, distance=self.distance)
+        require_non_negative(slack=self.slack)
 
 
 @dataclass(frozen=True)
@@ -119,7 +123,7 @@ def formation_arena(
         lattice = TriangleLattice((origin[0], origin[1]), math.radians(heading), f.side)
         way = _draw_way(random, lattice, p, f)
         if way is not None:
-            arena = _draw_arena(random, _kept_free(way, lattice, f), p)
+            arena = _draw_arena(random, _kept_free(way, lattice, f, p.slack), p)
             first = [*sorted(way[0]), *(way[1] - way[0])]
             places = np.array([lattice.positions(np.array(sorted(t))) for t in way])
             (last,) = way[-1] - way[-2]
@@ -155,7 +159,7 @@ def _draw_way(
     f: FormationParameters,
 ) -> list[Triangle] | None:
     """Draws the walk of triangles; None when it is too short or meets itself badly."""
-    half = np.array(p.size) / 2 - f.room - f.beyond
+    half = np.array(p.size) / 2 - f.room - f.beyond - p.slack
     reach = int(np.hypot(*half) / f.side * 2) + 2
     span = np.arange(-reach, reach + 1)
     grid = np.stack(np.meshgrid(span, span, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -217,7 +221,7 @@ def _shortest_way(
 
 
 def _kept_free(
-    way: list[Triangle], lattice: TriangleLattice, f: FormationParameters
+    way: list[Triangle], lattice: TriangleLattice, f: FormationParameters, slack: float
 ) -> PlanarShapes:
     """Returns the ground that the robots need on the way, and the lines along which they look."""
     lines: set[tuple[tuple[float, float], tuple[float, float], float]] = set()
@@ -238,7 +242,7 @@ def _kept_free(
         centres=line_ends.mean(axis=1),
         headings=np.arctan2(along[:, 1], along[:, 0]),
         sizes=np.stack([lengths, np.zeros_like(lengths)], axis=1),
-        radii=[width for _, _, width in ordered],
+        radii=[width + slack for _, _, width in ordered],
     )
 
 

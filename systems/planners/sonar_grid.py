@@ -47,6 +47,8 @@ class SonarGridParameters:
         margin: how far before an echo the free sector ends, besides half a cell, m: for the noise
             of ranges and poses.
         max_free_range: a cone without an echo is free no farther than this, m.
+        max_echo_range: an echo from farther away is no obstacle yet, m: its arc is so wide that it
+            would close ways that are free, and until a robot is nearer there is time to listen.
         max_shapes: that obstacles may be made of; where more would be needed, they are drawn with
             larger cells.
     """
@@ -63,6 +65,7 @@ class SonarGridParameters:
     free: float = 0.0
     margin: float = 0.03
     max_free_range: float = 4.0
+    max_echo_range: float = 1.6
     max_shapes: int = 250
 
     def __post_init__(self) -> None:
@@ -73,6 +76,7 @@ class SonarGridParameters:
             hit=self.hit,
             most=self.most,
             max_free_range=self.max_free_range,
+            max_echo_range=self.max_echo_range,
         )
         require_non_negative(margin=self.margin)
         for name, bound in (("miss", -self.hit), ("least", 0.0)):

@@ -93,7 +93,7 @@ def cones_of(
         ring: where its range finders are.
         others: (m, 2) where the other robots are, m.
         radii: (m,) of the circles in which they surely are, m.
-        parameters: for how far a sector is free.
+        parameters: for how far a sector is free, and up to where echoes count.
     """
     p = parameters
     c, s = math.cos(pose[2]), math.sin(pose[2])
@@ -115,7 +115,7 @@ def cones_of(
         near = (np.abs(echoes - distance) <= radius) & (aside <= ring.half_angle + width)
         on_robot |= near | (distance <= radius)
     on_robot &= heard
-    echoes[on_robot] = math.nan
+    echoes[on_robot | (echoes > p.max_echo_range)] = math.nan
     counts = Counter(bad_reading=int((~heard & ~nothing).sum()), on_robot=int(on_robot.sum()))
     half_angles = np.full(len(scan), ring.half_angle)
     return Cones(faces, directions, half_angles, free, echoes), counts
@@ -201,10 +201,9 @@ class SonarObstacles(LeafSystem):
             that were not finite (`bad_pose`).
 
     A wide cone tells the distance of a thing and not its direction: an obstacle comes out as wide
-    as the cone until another robot, or the same one from elsewhere, has listened past its ends. So
-    obstacles shrink as robots come nearer, and hardly ever grow. Where an echo may come from a
-    robot it says nothing of obstacles, only that nothing is nearer. The ground under a robot is
-    free.
+    as the cone until another robot, or the same one from elsewhere, has listened past its ends. An
+    echo from too far away, or from where a robot may be, is no obstacle: all that it says is that
+    nothing is nearer. The ground under a robot is free.
 
     How well a robot is known counts from the robot that it is known best from: by how much the
     whole formation has drifted is no matter to what it meets next.

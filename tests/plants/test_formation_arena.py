@@ -73,6 +73,14 @@ def test_wider_robots_get_a_wider_way() -> None:
         assert made.arena.footprints().distances_from(triangle).min() >= 0.6
 
 
+def test_slack_is_more_room_beside_the_way() -> None:
+    made, tight = formation_arena(1, FormationArenaParameters(slack=0.2)), formation_arena(1)
+    wide = FormationParameters().room + 0.2
+    found = fewest_moves(made.start, made.destination, made.arena.footprints(), wide)
+    assert found is not None
+    assert fewest_moves(tight.start, tight.destination, tight.arena.footprints(), wide) is None
+
+
 def test_all_obstacles_are_in_the_room_and_of_their_sizes() -> None:
     parameters = FormationArenaParameters(size=[12.0, 10.0], obstacles=20, distance=4.0)
     arena = formation_arena(0, parameters).arena
@@ -101,6 +109,7 @@ def test_a_room_without_a_way_is_refused() -> None:
         ("stops", -1),
         ("distance", 0.0),
         ("height", -1.0),
+        ("slack", -0.1),
     ],
 )
 def test_nonsense_is_refused(field: str, value: object) -> None:

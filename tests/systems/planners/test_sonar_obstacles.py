@@ -207,6 +207,17 @@ def test_readings_that_are_none_say_nothing() -> None:
     np.testing.assert_array_equal(np.isfinite(cones.echoes), np.arange(24) == 3)
 
 
+def test_an_echo_from_far_away_only_says_what_is_free() -> None:
+    ranges = np.full(24, np.inf)
+    ranges[:2] = [GRID.max_echo_range - 0.01, GRID.max_echo_range + 0.01]
+    cones, counts = cones_of(
+        scan_of(ranges), POSES[0], GEOMETRY, np.zeros((0, 2)), np.zeros(0), GRID
+    )
+    np.testing.assert_array_equal(np.isfinite(cones.echoes), np.arange(24) == 0)
+    np.testing.assert_allclose(cones.free[:2], ranges[:2] - 0.08)
+    assert not any(counts.values())
+
+
 def test_what_is_known_is_counted_from_the_nearest_known_robot() -> None:
     """All have drifted by a metre together; the third is known to 0.2 m, by x, from them."""
     drift = np.tile(np.diag([1.0, 1.0, 0.01]), (3, 3))
@@ -288,7 +299,8 @@ def test_three_robots_find_a_box_and_a_post_where_they_are() -> None:
     middles = found.polygons.mean(axis=1)
     from_box = np.hypot(*np.maximum(np.abs(middles - [2.4, 1.2]) - [0.2, 0.3], 0.0).T)
     from_post = np.hypot(*(middles - [-0.6, 0.9]).T) - 0.1
-    assert np.minimum(from_box, from_post).max() < 2.6 * math.sin(RING.half_angle) + 0.1
+    widest = GRID.max_echo_range * math.sin(RING.half_angle)
+    assert np.minimum(from_box, from_post).max() < widest + 0.1
     # Robots, their triangle and what is well off are free: a cone is 0.5 m wide at 2 m.
     for x, y, _ in POSES:
         assert is_free(x, y, 0.3)
