@@ -26,6 +26,7 @@ from diagrams.tables import Choice, Table
 from diagrams.world import WorldParameters
 from plants.arena import check_free
 from systems.controllers.formation_step import FormationStepParameters
+from systems.formation.building import SettlingParameters
 from systems.planners.formation_lattice import fit_lattice, strip
 from systems.planners.formation_moves import FormationParameters
 from systems.planners.formation_turns import FormationTurnsParameters
@@ -132,7 +133,8 @@ class FormationScenario(Scenario):
         same = self.step.side in (left_out, side)
         require(same, "step.side", self.step.side, f"formation.side, {side:g}; best left out")
         self.step = replace(self.step, side=side)
-        past = getattr(self.controller.arguments.get("parameters"), "beyond", 0.0)
+        settling = self.controller.arguments.get("parameters")
+        past = settling.beyond if isinstance(settling, SettlingParameters) else 0.0
         require(
             self.formation.beyond >= past,
             "formation.beyond",
