@@ -9,12 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 
+from diagrams.formation_checks import check_sight, check_sizes
+from diagrams.formation_faults import COMMAND, FailAs, RobotFault, check_faults, faults_of
 from diagrams.formation_mission import FormationMission
 from diagrams.formation_sensing import ring_of
 from diagrams.mission import Mission
@@ -78,6 +80,9 @@ class FormationScenario(Scenario):
         turns: how long things take.
         fail_robot: number of the robot that fails, from 1; none if left out.
         fail_at: when it does, s.
+        fail_as: what it is from then on: a `beacon` still, which only cannot move, or a `wreck`,
+            which neither sees nor is seen.
+        faults: what goes wrong with signals and motors for a time, by the number of the robot.
     """
 
     random_world: ClassVar[RandomWorld] = CLUTTER
@@ -98,6 +103,8 @@ class FormationScenario(Scenario):
     turns: FormationTurnsParameters = field(default_factory=FormationTurnsParameters)
     fail_robot: int | None = None
     fail_at: float = 0.0
+    fail_as: FailAs = "beacon"
+    faults: list[RobotFault] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -116,17 +123,11 @@ class FormationScenario(Scenario):
                 list(self.robot.sensors),
                 f"with {name}",
             )
-        ring = getattr(self.robot.body.build(), "ring", None)
+        ring = self.ring()
         require(ring is not None, "robot.body.ring", ring, "markers for the others to see")
         if self.obstacles == "sensed":
             ring_of(self.robot)
-        fails = self.fail_robot
-        require(
-            fails is None or 1 <= fails <= self.robots,
-            "fail_robot",
-            fails,
-            f"one of 1 to {self.robots}",
-        )
+        check_faults(self)
         side = self.formation.side
         require_positive(side=side)
         left_out = FormationStepParameters().side
@@ -155,6 +156,8 @@ class FormationScenario(Scenario):
             "[x, y] in metres",
         )
         check_free(self.world.arena, self.destination, room, "destination")
+        check_sight(self)
+        check_sizes(self)
 
     def places(self) -> Array:
         """Returns where the robots stand at the start, (N, 2) m."""
@@ -167,19 +170,28 @@ class FormationScenario(Scenario):
         heading = math.radians(self.heading_deg)
         return np.column_stack([self.places(), np.full(self.robots, heading)])
 
+    def ring(self) -> Any:
+        """Returns the markers that each robot bears, a `plants.marker_ring.MarkerRing`."""
+        return getattr(self.robot.body.build(), "ring", None)
+
+    def cameras(self) -> tuple[str, ...]:
+        """Returns the names of the cameras that the formation looks with."""
+        return CAMERAS
+
     def names(self) -> list[str]:
         """Returns the names of the robots."""
         return [f"robot{k + 1}" for k in range(self.robots)]
 
     def station_robots(self) -> dict[str, RobotParameters]:
         """Returns the robots by name."""
-        hardware = vars(self.robot)
-        return {
-            name: RobotParameters(
-                **hardware, start=Start(x=float(x), y=float(y), heading_deg=self.heading_deg)
+        hardware, robots = vars(self.robot), {}
+        for k, (name, (x, y)) in enumerate(zip(self.names(), self.places(), strict=True), 1):
+            faults = [fault for fault in faults_of(self, k) if fault.signal != COMMAND]
+            start = Start(x=float(x), y=float(y), heading_deg=self.heading_deg)
+            robots[name] = RobotParameters(
+                **hardware | {"faults": [*self.robot.faults, *faults]}, start=start
             )
-            for name, (x, y) in zip(self.names(), self.places(), strict=True)
-        }
+        return robots
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:
         """Wires station, controllers, estimator and planner.

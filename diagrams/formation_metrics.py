@@ -32,6 +32,8 @@ class MoveEnd:
         lateral: of place against vertex, m.
         longitudinal: m.
         sides: (2,) true distances to beacons 1 and 2, m.
+        waits: how often it stood and waited.
+        retries: tries after the first.
     """
 
     number: int
@@ -45,6 +47,8 @@ class MoveEnd:
     lateral: float
     longitudinal: float
     sides: Array
+    waits: int
+    retries: int
 
     def to_plain(self) -> dict[str, Any]:
         """Returns plain data."""
@@ -60,7 +64,7 @@ class FormationLog:
 
     Attributes:
         t: (m,) s.
-        record: (m, 8) as `FormationTurns` sends it.
+        record: (m, 10) as `FormationTurns` sends it.
         truth: (m, n, 3) true poses; None when nobody knows them.
         believed: (m, n, 2) m, where the robots are believed to be.
         estimate: (m, n, 3) of the estimator, if there is one.
@@ -100,6 +104,8 @@ class FormationLog:
             lateral=float(lateral),
             longitudinal=float(longitudinal),
             sides=np.linalg.norm(stand[:2] - place, axis=1),
+            waits=int(rest[6]),
+            retries=int(rest[7]),
         )
 
 
@@ -111,9 +117,12 @@ def formation_metrics(log: FormationLog, side: float) -> dict[str, Any]:
     nominal one. `broken`: whether one of those was outside 0.6 to 1.6 times that.
     `lateral_error_mm` and `longitudinal_error_mm`: means of the sizes, of each place against the
     vertex of its beacons where those truly stand; they take the estimator's corrections for errors.
-    `nees_mean`: of all poses together after each move, per dimension.
+    `nees_mean`: of all poses together after each move, per dimension. `waits`: how often a robot
+    on its way stood and waited; `retries`: tries of moves after the first; `replans`: moves that
+    were given up, and others planned.
     """
     moves = [move for move in log.moves() if move.done]
+    ended = log.record[log.ends()]
     metrics: dict[str, Any] = {
         "moves": int(log.record[-1, 0]) if len(log.record) else 0,
         "destination_error_m": None,
@@ -122,6 +131,9 @@ def formation_metrics(log: FormationLog, side: float) -> dict[str, Any]:
         "lateral_error_mm": None,
         "longitudinal_error_mm": None,
         "nees_mean": nees_mean(log),
+        "waits": int(ended[:, 8].sum()),
+        "retries": int(ended[:, 9].sum()),
+        "replans": int((ended[:, 7] < 0).sum()),
     }
     if not moves:
         return metrics

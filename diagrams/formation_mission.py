@@ -12,6 +12,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource
 
+from diagrams.formation_faults import COMMAND, faults_of
 from diagrams.formation_metrics import FormationLog, formation_metrics
 from diagrams.formation_sensing import (
     add_obstacles,
@@ -22,11 +23,13 @@ from diagrams.formation_sensing import (
 from diagrams.formation_summary import plot_formation
 from diagrams.formation_viewer import FormationViewer
 from diagrams.mission import Mission, Wiring
+from diagrams.schema import ScenarioError
 from diagrams.trajectories import write_tum
 from systems.controllers.formation_cameras import FormationCameras
 from systems.planners.failure import Failure
 from systems.planners.formation_planner import FormationPlanner
 from systems.planners.formation_turns import FormationTurns
+from systems.sensors.faults import FaultInjector
 
 if TYPE_CHECKING:
     from diagrams.formation import FormationScenario
@@ -83,7 +86,13 @@ class FormationMission(Mission):
             estimator = scenario.estimator.build(start_poses=start, camera=cameras[CAMERAS[0]])
             wiring.add(estimator, "estimator")
         fails = None if scenario.fail_robot is None else scenario.fail_robot - 1
-        wiring.add(Failure(robots=scenario.robots, robot=fails, at=scenario.fail_at), "failure")
+        failure = Failure(
+            robots=scenario.robots,
+            robot=fails,
+            at=scenario.fail_at,
+            beacon=scenario.fail_as == "beacon",
+        )
+        wiring.add(failure, "failure")
         wiring.add(ConstantVectorSource(scenario.destination), "destination")
         wiring.add(FormationCameras(robots=scenario.robots, cameras=CAMERAS), "cameras")
 
@@ -101,11 +110,12 @@ class FormationMission(Mission):
                     wiring.connect(f"cameras.robot{k}_{camera}_active", active)
             wiring.connect(f"turns.task_{k}", f"controller_{k}.task")
             wiring.connect(f"controller_{k}.status", f"turns.status_{k}")
-            wiring.connect(f"controller_{k}.command", f"{name}.drive.command")
+            wiring.connect(self._command(k), f"{name}.drive.command")
         wiring.connect("turns.looking", "cameras.looking")
         if wiring.has_block("estimator"):
             wiring.connect("turns.moving", "estimator.moving")
             wiring.connect("estimator.poses", "turns.poses")
+            wiring.connect("estimator.covariance", "turns.covariance")
         wiring.connect("planner.move", "turns.move")
         wiring.connect("turns.positions", "planner.positions")
         wiring.connect("turns.progress", "planner.progress")
@@ -113,6 +123,23 @@ class FormationMission(Mission):
             wiring.connect("failure.failed", f"{block}.failed")
         wiring.connect("destination.y0", "planner.destination")
         wiring.connect(add_obstacles(wiring, self._scenario), "planner.obstacles")
+
+    def _command(self, robot: int) -> str:
+        """Returns the output that commands a robot, with the faults that its motors have."""
+        command = f"controller_{robot}.command"
+        faults = [f for f in faults_of(self._scenario, robot + 1) if f.signal == COMMAND]
+        if not faults:
+            return command
+        name = self._names[robot]
+        try:
+            injector = FaultInjector(
+                model=2, faults=faults, rate=_COMMAND_RATE, seed=self._scenario.seed, name=name
+            )
+        except ValueError as error:
+            raise ScenarioError(f"faults of {name}.{COMMAND}: {error}") from error
+        self._wiring.add(injector, f"motors_{robot}")
+        self._wiring.connect(command, f"motors_{robot}.input")
+        return f"motors_{robot}.output"
 
     def _log(self) -> None:
         kinds = ("pose", "contacts", "clearance")
@@ -220,8 +247,7 @@ def _view(places: Array) -> tuple[Array, Array]:
     return np.array(eye), np.array([*middle, 0.0])
 
 
-_FRAME_RATE = (
-    10.0  # Hz: runs are long and robots slow; twice as many make the replay twice as large
-)
+_COMMAND_RATE = 20.0  # Hz
+_FRAME_RATE = 10.0  # Hz: runs are long and robots slow; twice as many make the replay as large
 _LOG_RATE = 5.0  # Hz: moves take half a minute
 _HOPE = 5.0  # s, for which the way must be blocked

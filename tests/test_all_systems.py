@@ -75,6 +75,7 @@ from systems.controllers.collision_monitor import CollisionMonitor
 from systems.controllers.formation_cameras import FormationCameras
 from systems.controllers.search import SearchWhenLost
 from systems.controllers.shell_route import Leg, ShellRoute
+from systems.controllers.step_task import StepTask
 from systems.controllers.triangle_algorithm1 import TriangleAlgorithm1
 from systems.controllers.triangle_resection import TriangleResection
 from systems.controllers.waypoints import WaypointController
@@ -365,10 +366,14 @@ ESTIMATES = (marker_pose(0.5), marker_pose(0.51))
 def formation_step(kind: type) -> Case:
     """A step between the beacons 0, 1 and 2, and another one."""
     system = kind(front_camera=CAMERA, rear_camera=CAMERA, **FORMATION_OPTIONS.get(kind, {}))
-    task = [0, 1, 2, 2.25, 0, 0, 1.5, 1.3, 0, 0.75, 0, 0, 3.0, 1.3, 0, 1.3]
+    poses = np.array([[2.25, 0, 0], [1.5, 1.3, 0], [0.75, 0, 0]])
+    tasks = tuple(
+        StepTask(number, np.arange(3), poses, np.array([3.0, 1.3]), np.array([0, 1.3]))
+        for number in (1, 2)
+    )
     seen = (detections(0.0), detections(0.1))
     inputs = {"front_detections": seen, "rear_detections": seen}
-    return Case(system, {**inputs, "task": (np.array([1, *task]), np.array([2, *task]))})
+    return Case(system, {**inputs, "task": tasks})
 
 
 # The narrow camera of these tests holds 80 px aside.
@@ -444,8 +449,9 @@ CASES: dict[type, Callable[[Path], Case]] = {
         {
             "move": (FormationMove(), FormationMove(stamp=0.0, status="moving", number=1)),
             "poses": vector(*range(12)),
+            "covariance": vector(*(1e-4 * np.eye(12)).ravel()),
             "failed": vector(0.0, 0.0, 0.0, 0.0),
-            **{f"status_{k}": vector(0.0, 0.0) for k in range(4)},
+            **{f"status_{k}": vector(0.0, 0.0, 0.0) for k in range(4)},
         },
     ),
     FormationViewer: lambda _: Case(

@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.analysis import Simulator
 
 from systems.angles import spatial_pose
 from systems.cameras import PinholeCamera
-from systems.controllers.formation_step import FormationStep, Status, StepTask
+from systems.controllers.formation_step import FormationStep
+from systems.controllers.step_task import Status, StepTask
 from systems.formation.bearing_filter import moved
 from systems.formation.triangles import arrival_heading, components, next_vertex
 from systems.markers.family import family
@@ -141,7 +143,7 @@ def run_step(
     simulator = Simulator(system)
     context = simulator.get_mutable_context()
     ports = (system.front_detections_input_port(), system.rear_detections_input_port())
-    system.task_input_port().FixValue(context, task.vector())
+    system.task_input_port().FixValue(context, AbstractValue.Make(task))
     pose, path, under_way = world.poses[world.mover].copy(), [], []
     since: dict[Status, float] = {}
     for step in range(round(limit / dt)):

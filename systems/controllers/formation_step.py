@@ -14,7 +14,6 @@ import math
 from abc import abstractmethod
 from collections import Counter
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
@@ -23,69 +22,13 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.cameras import PinholeCamera
+from systems.controllers.step_task import OFF, STATUS_SIZE, Status, StepTask
 from systems.formation.axes import SIDES
 from systems.health import Counts
 from systems.messages import Detections
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
-
-TASK_SIZE = 17
-
-
-class Status(IntEnum):
-    """How far a step is."""
-
-    IDLE = 0
-    APPROACH = 1
-    PASS = 2
-    BUILD = 3
-    DONE = 4
-    WAITING = 5
-
-
-class StepTask(NamedTuple):
-    """What a robot is to do; a vector on a port.
-
-    Attributes:
-        number: of the step; a new number begins anew, 0 is no task.
-        beacons: (3,) numbers of the robots that stand as beacons 1, 2 and 3.
-        poses: (3, 3) what is believed of theirs, [x (m), y (m), theta (rad)]. Where a
-            heading is NaN, the axis of the robot is found from a marker's shape.
-        target: (2,) the vertex to settle on, m.
-        start: (2,) where the robot is believed to be, m.
-    """
-
-    number: int
-    beacons: NDArray[np.int64]
-    poses: Array
-    target: Array
-    start: Array
-
-    def vector(self) -> Array:
-        """Returns it as (17,) [number, beacons, poses row by row, target, start]."""
-        return np.concatenate(
-            [[self.number], self.beacons, np.ravel(self.poses), self.target, self.start]
-        )
-
-    @staticmethod
-    def from_vector(vector: Array) -> StepTask | None:
-        """Returns the task of a vector; None if it is none.
-
-        Those are: numbers that are not whole or negative, and beacons that are not different.
-        """
-        numbers = vector[:4]
-        if not (np.isfinite(numbers).all() and (numbers == np.round(numbers)).all()):
-            return None
-        beacons = numbers[1:].astype(np.int64)
-        if numbers[0] < 0 or beacons.min() < 0 or len(set(beacons.tolist())) < 3:
-            return None
-        return StepTask(
-            int(numbers[0]), beacons, vector[4:13].reshape(3, 3), vector[13:15], vector[15:17]
-        )
-
-
-OFF = StepTask(0, np.arange(3), np.zeros((3, 3)), np.zeros(2), np.zeros(2))
 
 
 @dataclass
@@ -101,6 +44,7 @@ class FormationStepParameters:
         max_age: pictures older than this are not looked at, s.
         patience: how long the robot stands and waits before it tries again, s.
         retreat: how far it goes back for another try, m.
+        way_speed: on a way of more than two centre points, where nothing is built yet, m/s.
     """
 
     side: float = 1.5
@@ -111,6 +55,7 @@ class FormationStepParameters:
     max_age: float = 1.0
     patience: float = 3.0
     retreat: float = 0.3
+    way_speed: float = 0.2
 
     def __post_init__(self) -> None:
         values = dict(vars(self))
@@ -128,7 +73,7 @@ class View(NamedTuple):
     Attributes:
         stamp: of the picture, s; NaN when there is none that may be looked at.
         fresh: it was not looked at before.
-        ids: (n,) of the markers of the step's beacons.
+        ids: (n,) of the markers of robots that stand.
         rays: (n, 4, 2) x/z, y/z of their corners.
         strange: markers that are no readings: corners not finite, or the same id twice.
     """
@@ -143,9 +88,9 @@ class View(NamedTuple):
 NOTHING = View(math.nan, False, np.zeros(0, np.int64), np.zeros((0, 4, 2)), 0)
 
 
-def view(detections: Detections, beacons: NDArray[np.int64], camera: PinholeCamera) -> View:
-    """Returns what detections show of the beacons; none of an id that was found twice."""
-    ids, found = np.asarray(detections.ids), np.isin(detections.ids // SIDES, beacons)
+def view(detections: Detections, robots: NDArray[np.int64], camera: PinholeCamera) -> View:
+    """Returns what detections show of some robots; none of an id that was found twice."""
+    ids, found = np.asarray(detections.ids), np.isin(detections.ids // SIDES, robots)
     counts = Counter(ids.tolist())
     sound = np.array([counts[k] == 1 for k in ids.tolist()], bool)
     sound &= np.isfinite(detections.corners).all(axis=(1, 2))
@@ -189,9 +134,9 @@ class FormationStep(LeafSystem):
             self.DeclareAbstractInputPort("front_detections", nothing),
             self.DeclareAbstractInputPort("rear_detections", nothing),
         )
-        self._task_input = self.DeclareVectorInputPort("task", TASK_SIZE)
+        self._task_input = self.DeclareAbstractInputPort("task", AbstractValue.Make(OFF))
         self._command = self.DeclareDiscreteState(2)
-        self._status = self.DeclareDiscreteState(2)
+        self._status = self.DeclareDiscreteState(STATUS_SIZE)
         self._stamps = self.DeclareDiscreteState([math.nan, math.nan])  # of the last pictures used
         self._memory = self.DeclareDiscreteState(memory)
         self.DeclarePeriodicDiscreteUpdateEvent(self._dt, 0.0, self._update)
@@ -253,14 +198,14 @@ class FormationStep(LeafSystem):
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
         counts: Counter[str] = Counter()
-        task = StepTask.from_vector(self._task_input.Eval(context))
-        number, status = context.get_discrete_state(self._status).get_value()
+        task: StepTask = self._task_input.Eval(context)
+        number, status, tries = context.get_discrete_state(self._status).get_value()
         memory = context.get_discrete_state(self._memory).get_value()
-        if task is None:
+        if not task.sound:
             counts["bad_task"] += 1
             task = OFF
         if task.number != number:
-            status, memory = Status.IDLE, self._reset()
+            status, memory, tries = Status.IDLE, self._reset(), 0.0
         command = [0.0, 0.0]
         if task.number == 0:
             status = Status.IDLE
@@ -275,7 +220,8 @@ class FormationStep(LeafSystem):
                 counts,
             )
         discrete_state.set_value(self._command, command)
-        discrete_state.set_value(self._status, [task.number, float(status)])
+        tries += counts["retries"]
+        discrete_state.set_value(self._status, [task.number, float(status), tries])
         discrete_state.set_value(self._memory, memory)
         self._counts.add(context, discrete_state, **counts)
 
@@ -290,7 +236,7 @@ class FormationStep(LeafSystem):
             stamp, shown = detections.stamp, NOTHING
             age = context.get_time() - stamp
             if -self._dt <= age <= self._step_parameters.max_age:
-                shown = view(detections, task.beacons, camera)._replace(fresh=stamp != before)
+                shown = view(detections, task.robots(), camera)._replace(fresh=stamp != before)
                 counts["misread"] += shown.strange * shown.fresh
             elif not math.isnan(stamp):
                 counts["stale"] += 1
@@ -300,8 +246,16 @@ class FormationStep(LeafSystem):
         return views[0], views[1]
 
 
-def check_view(camera: PinholeCamera, pixels: float, name: str) -> None:
-    """Raises `ValueError` unless the camera's picture holds `pixels` on either side of its axis."""
+def check_view(camera: PinholeCamera, pixels: float, name: str, whose: str) -> None:
+    """Raises `ValueError` unless the camera's picture holds `pixels` on either side of its axis.
+
+    Args:
+        camera: intrinsics.
+        pixels: that it must hold.
+        name: of the number, for the message.
+        whose: name of the camera, for the message.
+    """
     centre = camera.K[0, 2]
     room = min(centre + 0.5, camera.width - 0.5 - centre)
-    require(pixels < room, name, pixels, f"less than {room:g}, what the picture holds aside")
+    allowed = f"less than {room:g}, what the picture of {whose} holds aside"
+    require(pixels < room, name, pixels, allowed)

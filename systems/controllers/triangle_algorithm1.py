@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
@@ -18,20 +18,24 @@ from systems.cameras import PinholeCamera
 from systems.controllers.formation_step import (
     FormationStep,
     FormationStepParameters,
-    Status,
-    StepTask,
     View,
     check_view,
 )
+from systems.controllers.step_localizer import Fix, ResectionTrustParameters, StepLocalizer
+from systems.controllers.step_task import Status, StepTask
 from systems.formation.axes import beacon_axes
+from systems.formation.bearing_filter import BearingFilterParameters
 from systems.formation.building import FORWARD, Algorithm1Parameters, algorithm1
-from systems.formation.triangles import HEIGHT, arrival_heading, next_vertex
+from systems.formation.triangles import HEIGHT, arrival_heading, next_vertex, orientation
 
 Array = NDArray[np.float64]
 
 _CENTRED = math.radians(2.0)
 _HALF_TURN_OF_PASS = math.radians(30.0)  # from the entry's line to the inside, and out again
 _ROUND = 2 * math.pi + 0.5
+_SCALARS = 6
+_SHORT_WAY = 2  # centre points: entry and exit of the beacons' own triangle
+_AT_VERTEX = 0.3  # sides
 
 
 class Stage(IntEnum):
@@ -45,6 +49,7 @@ class Stage(IntEnum):
     TURN_OUT = 5
     BUILD = 6
     RETREAT = 7
+    WAY = 8
 
 
 _STATUS = {
@@ -56,6 +61,7 @@ _STATUS = {
     Stage.TURN_OUT: Status.PASS,
     Stage.BUILD: Status.BUILD,
     Stage.RETREAT: Status.BUILD,
+    Stage.WAY: Status.APPROACH,
 }
 
 
@@ -64,18 +70,30 @@ class _Memory:
     """What is remembered from one decision to the next.
 
     Attributes:
-        stage: what the robot is at.
+        fix: where the robot is, on a long way.
+        stage: what it is at.
         left: distance (m) or angle (rad) that is left of the stage, by the commands.
         turn: +1 when the pivot is to the left at the entry, -1 to the right, 0 not yet known.
         direction: of the shunt.
         waited: for a beacon, s.
+        passed: centre points of a long way that lie behind the robot.
     """
 
+    fix: Fix
     stage: float = Stage.AIM
     left: float = _ROUND
     turn: float = 0.0
     direction: float = FORWARD
     waited: float = 0.0
+    passed: float = 0.0
+
+    @staticmethod
+    def from_vector(v: Array) -> _Memory:
+        return _Memory(Fix.from_vector(v[_SCALARS:]), *v[:_SCALARS].tolist())
+
+    def vector(self) -> Array:
+        scalars = [self.stage, self.left, self.turn, self.direction, self.waited, self.passed]
+        return np.concatenate([scalars, self.fix.vector()])
 
     def enter(self, stage: Stage, left: float) -> None:
         self.stage, self.left, self.waited = stage, left, 0.0
@@ -106,14 +124,16 @@ class TriangleAlgorithm1(FormationStep):
     Ports:
         front_detections (input, Detections): markers that the front camera shows.
         rear_detections (input, Detections): markers that the rear camera shows.
-        task (input, vector of 17): a `StepTask`; of the poses it uses nothing but which way the
-            beacons' faces look, to tell a marker's place from the robot's axis.
+        task (input, StepTask): of the poses it uses nothing but which way the beacons' faces look,
+            to tell a marker's place from the robot's axis; on a long way all of it.
         command (output, vector of 2): [v (m/s), omega (rad/s)], at `rate`; zeros without a task,
             when done, and while it waits.
-        status (output, vector of 2): [number of the task, `Status`], at `rate`.
+        status (output, vector of 3): [number of the task, `Status`, tries after the first], at
+            `rate`.
         health (output, Health): vectors that are no task; pictures that came too late; markers
             that cannot be what they say (found twice, or a beacon on the wrong side of the anchor);
-            fresh pictures without a beacon that was needed; tries after the first.
+            fresh pictures without a beacon that was needed; tries after the first; estimates of a
+            long way that were given up.
 
     Approach: the front camera keeps beacon 1 centred. From where the other two are 280 px aside, or
     leave the picture, the entry is as far as the triangle is high, and that is driven by the
@@ -121,11 +141,17 @@ class TriangleAlgorithm1(FormationStep):
     the commands, since nothing that would help is in the picture. Build: the rear camera keeps the
     anchor centred and Algorithm I finds the vertex; see `systems.formation.building`.
 
+    A long way is one of more than two centre points, or from elsewhere than the vertex outside the
+    entry. [FORM] does not say what leads the robot there; no single beacon ahead does. Here it is
+    the bearings of all that stand at their believed places, as in `TriangleResection`, up to the
+    exit. From there on it is lateral pixels again, so a step's error is that of Algorithm I.
+
     A beacon that is not seen where it is needed: the robot stands (`waiting`) and goes on when it
     sees it; after `patience` it goes back by `retreat`, or turns round once, and tries again, as
     often as it must: whoever gave the task decides when that is enough.
 
-    Source: [FORM] 2, as far as it is legible; passing and steering are our reading.
+    Source: [FORM] 2, as far as it is legible; passing and steering are our reading, the long way is
+    ours.
 
     Raises:
         ValueError: rate or parameters out of range, or a camera whose picture does not hold `dt`.
@@ -141,19 +167,26 @@ class TriangleAlgorithm1(FormationStep):
         rate: float = 20.0,
     ) -> None:
         self._parameters = parameters or Algorithm1Parameters()
-        for camera in (front_camera, rear_camera):
-            check_view(camera, self._parameters.dt, "dt")
+        for whose, camera in (("front_camera", front_camera), ("rear_camera", rear_camera)):
+            check_view(camera, self._parameters.dt, "dt", whose)
+        self._localizer = StepLocalizer(
+            cameras=(front_camera, rear_camera),
+            step=step or FormationStepParameters(),
+            noise=BearingFilterParameters(),
+            trust=ResectionTrustParameters(),
+            rate=rate,
+        )
         super().__init__(
             front_camera=front_camera,
             rear_camera=rear_camera,
             step=step,
             rate=rate,
             memory=self._reset(),
-            reasons=(),
+            reasons=("relocated",),
         )
 
     def _reset(self) -> Array:
-        return np.array(astuple(_Memory()), float)
+        return _Memory(self._localizer.begin()).vector()
 
     def _act(
         self,
@@ -161,10 +194,15 @@ class TriangleAlgorithm1(FormationStep):
         memory: Array,
         views: tuple[View, View],
         command: Array,
-        now: float,  # noqa: ARG002 - time is counted in control periods
+        now: float,
         counts: Counter[str],
     ) -> tuple[Array, list[float], Status]:
-        m = _Memory(*memory.tolist())
+        m = _Memory.from_vector(memory)
+        if m.stage == Stage.AIM and self._is_long(task):
+            m.stage = Stage.WAY
+        if m.stage == Stage.WAY:
+            wanted, status = self._follow_way(m, task, views, command, now, counts)
+            return m.vector(), wanted, status
         m.left -= abs(command[0] or command[1]) * self._dt
         setback = self._step_parameters.marker_distance / self._step_parameters.marker_size
         fresh = any(shown.fresh for shown in views)
@@ -174,25 +212,57 @@ class TriangleAlgorithm1(FormationStep):
             for shown, k, line in zip(views, (0, 2), _lines(task.poses[:, :2]), strict=True)
         )
         stage = Stage(int(m.stage))
-        wanted: list[float] | None
+        found: list[float] | None
         if stage == Stage.BUILD:
             focal_length = self._cameras[1].K[0, 0]
-            wanted, done = self._build(m, rear * focal_length, focal_length, fresh, counts)
+            found, done = self._build(m, rear * focal_length, focal_length, fresh, counts)
             if done:
-                return np.array(astuple(m), float), [0.0, 0.0], Status.DONE
+                return m.vector(), [0.0, 0.0], Status.DONE
         elif stage in (Stage.AIM, Stage.RECEDE, Stage.ENTER):
-            wanted = self._approach(m, stage, front, fresh, counts)
+            found = self._approach(m, stage, front, fresh, counts)
         else:
-            wanted = self._pass(m, stage, rear[2])
-        if wanted is None:
+            found = self._pass(m, stage, rear[2])
+        if found is None:
             counts["hidden"] += fresh
             m.waited += self._dt
             if m.waited > self._step_parameters.patience:
                 counts["retries"] += 1
                 self._retry(m, stage)
-            return np.array(astuple(m), float), [0.0, 0.0], Status.WAITING
+            return m.vector(), [0.0, 0.0], Status.WAITING
         m.waited = 0.0
-        return np.array(astuple(m), float), wanted, _STATUS[Stage(int(m.stage))]
+        return m.vector(), found, _STATUS[Stage(int(m.stage))]
+
+    def _is_long(self, task: StepTask) -> bool:
+        """Whether the way is more than entry and exit, or does not begin before the entry."""
+        off = np.hypot(*(task.start - next_vertex(task.poses[::-1, :2])))
+        elsewhere = bool(off > _AT_VERTEX * self._step_parameters.side)
+        return elsewhere or len(task.way()) > _SHORT_WAY
+
+    def _follow_way(
+        self,
+        m: _Memory,
+        task: StepTask,
+        views: tuple[View, View],
+        command: Array,
+        now: float,
+        counts: Counter[str],
+    ) -> tuple[list[float], Status]:
+        """Returns the command on a long way, by where all that stand are seen."""
+        pose, seen = self._localizer.look(m.fix, task, views, command, now, counts, behind=False)
+        fresh = any(shown.fresh for shown in views)
+        if recovering := self._localizer.recover(m.fix, fresh, seen, counts):
+            return recovering
+        way = task.way()
+        speed = max(self._parameters.speed, self._step_parameters.way_speed)
+        while m.passed < len(way):
+            wanted = self._localizer.follow(pose, way[int(m.passed) :], speed)
+            if wanted is not None:
+                return wanted, Status.PASS if m.passed else Status.APPROACH
+            m.passed += 1
+        # Beacons that are listed counterclockwise have the pivot to the left of who enters.
+        m.turn = float(orientation(task.poses[:, :2]))
+        m.enter(Stage.TURN_OUT, _HALF_TURN_OF_PASS)
+        return [0.0, 0.0], Status.PASS
 
     def _retry(self, m: _Memory, stage: Stage) -> None:
         if stage == Stage.BUILD:

@@ -104,8 +104,8 @@ def fit_lattice(
 def strip(robots: int, side: float) -> Array:
     """Returns where robots stand in a straight strip of triangles along x, (n, 2) m.
 
-    Of four with sides of 1.5 m it is the start of [FORM]: (0.75, 0), (0, 1.30), (2.25, 0) and
-    (1.5, 1.30) m.
+    The first four with sides of 1.5 m are the start of [FORM]: (0.75, 0), (0, 1.30), (2.25, 0) and
+    (1.5, 1.30) m; all others stand behind them, toward -x.
 
     Raises:
         ValueError: fewer than three robots.
@@ -113,8 +113,8 @@ def strip(robots: int, side: float) -> Array:
     require(robots >= 3, "robots", robots, "3 or greater")
     require_positive(side=side)
     place = np.arange(robots)
-    swapped = np.where(place ^ 1 < robots, place ^ 1, place)
-    return side * np.stack([swapped / 2, _SIXTY.imag * (swapped % 2 == 0)], axis=-1)
+    along = np.where(place < 4, np.where(place ^ 1 < robots, place ^ 1, place), 3 - place)
+    return side * np.stack([along / 2, _SIXTY.imag * (along % 2 == 0)], axis=-1)
 
 
 def mirrored(r: Vertex, p: Vertex, q: Vertex) -> Vertex:

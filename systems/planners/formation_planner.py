@@ -82,6 +82,7 @@ class Memory(Message):
         fixed: robots that cannot move, and still mark the vertex that they stand at.
         wrecks: where other robots have failed, (2,) m each, by number; NaN where it is not known.
         given_up: (robot, vertex) since the last move that succeeded.
+        unplaced: moves so far that were said to be done, by robots that were not found afterwards.
         been: sets of vertices that were taken since something else changed.
         destination: (2,) m, and
         obstacles: for which the last plan was made.
@@ -93,6 +94,7 @@ class Memory(Message):
     fixed: frozenset[int] = frozenset()
     wrecks: Mapping[int, Array] = field(default_factory=dict)
     given_up: frozenset[tuple[int, Vertex]] = frozenset()
+    unplaced: int = 0
     been: frozenset[frozenset[Vertex]] = frozenset()
     destination: Array = field(default_factory=lambda: np.full(2, math.nan))
     obstacles: Obstacles = field(default_factory=Obstacles)
@@ -136,10 +138,11 @@ def after(
     """
     vertices, wrecks, given_up = dict(memory.vertices), dict(memory.wrecks), memory.given_up
     move = memory.move
+    unplaced = report.outcome > 0 and not np.isfinite(report.positions[move.mover]).all()
     under_way = move.status == "moving"
     if under_way and memory.target is not None and report.outcome != 0:
         under_way = False
-        if report.outcome > 0:
+        if report.outcome > 0 and not unplaced:
             vertices[move.mover] = memory.target
             given_up = frozenset()
         else:
@@ -164,6 +167,7 @@ def after(
         fixed=(memory.fixed | fixed) - wrecks.keys(),
         wrecks=wrecks,
         given_up=given_up,
+        unplaced=memory.unplaced + (unplaced and memory.target is not None),
         destination=report.destination if not under_way else memory.destination,
         obstacles=report.obstacles,
     )
@@ -172,6 +176,7 @@ def after(
         or kept.fixed != memory.fixed
         or other_obstacles
         or report.outcome < 0
+        or unplaced
         or not np.array_equal(report.destination, memory.destination)
     )
     if changed:
@@ -347,7 +352,9 @@ class FormationPlanner(LeafSystem):
         move (output, FormationMove): updated at `rate`, a new message only when there is something
             new to say.
         health (output, Health): looks at destinations or obstacles that could not be used, while
-            the last ones count, and at positions of robots still able that were not finite.
+            the last ones count, and at positions of robots still able that were not finite
+            (`bad_position`); moves that were said to be done, but where is the robot? (`unplaced`):
+            its position is not finite, it is no beacon, and the next move does without it.
 
     A robot that cannot move serves as a beacon until it is left behind; then, or when it fails on
     the way or is no beacon either, it is an obstacle. What still hangs together is the formation,
@@ -395,7 +402,7 @@ class FormationPlanner(LeafSystem):
             ),
             {self.abstract_state_ticket(self._memory)},
         )
-        self._counts = Counts(self, "bad_position", "bad_destination", "bad_obstacles")
+        self._counts = Counts(self, "bad_position", "bad_destination", "bad_obstacles", "unplaced")
 
     def positions_input_port(self) -> InputPort:
         """Returns the port of the estimated positions."""
@@ -436,19 +443,19 @@ class FormationPlanner(LeafSystem):
         bad_position = bool((~np.isfinite(positions).all(axis=1) & (failed == 0)).any())
         bad_destination = not np.isfinite(destination).all()
         bad_obstacles = not obstacles.sound
-        discrete_state: Any = state.get_mutable_discrete_state()
-        self._counts.add(
-            context,
-            discrete_state,
-            bad_position=bad_position,
-            bad_destination=bad_destination,
-            bad_obstacles=bad_obstacles,
-        )
         if bad_obstacles:
             obstacles = memory.obstacles
         if bad_destination:
             destination = memory.destination
+        unplaced = memory.unplaced
+        discrete_state: Any = state.get_mutable_discrete_state()
+        bad = {
+            "bad_position": bad_position,
+            "bad_destination": bad_destination,
+            "bad_obstacles": bad_obstacles,
+        }
         if not np.isfinite(destination).all():
+            self._counts.add(context, discrete_state, **bad)
             return EventStatus.Succeeded()
         known = number == memory.move.number and np.isfinite(outcome)
         report = Report(
@@ -460,6 +467,7 @@ class FormationPlanner(LeafSystem):
             outcome=int(np.sign(outcome)) if known else 0,
         )
         memory = after(memory, report, self._lattice, self._parameters, self._rule)
+        self._counts.add(context, discrete_state, **bad, unplaced=memory.unplaced - unplaced)
         slot: Any = state.get_mutable_abstract_state(int(self._memory))
         slot.set_value(memory)
         return EventStatus.Succeeded()

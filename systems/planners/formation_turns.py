@@ -10,15 +10,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    Context,
+    DiscreteValues,
+    EventStatus,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    State,
+)
 
-from systems.controllers.formation_step import OFF, TASK_SIZE, Status, StepTask
+from systems.controllers.step_task import OFF, STATUS_SIZE, Status, StepTask
 from systems.formation.triangles import arrival_heading
 from systems.health import Counts
 from systems.planners.formation_planner import FormationMove
+from systems.planners.formation_tasks import not_found, task_of, way_length
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
+
+RECORD_SIZE = 10
 
 
 class Phase(IntEnum):
@@ -39,19 +50,29 @@ class FormationTurnsParameters:
         start_time: from the announcement of a move to its task, s.
         stop_time: from the end of a task until the robot stands for sure, s.
         look_time: for which all look at each other then, s.
-        patience: of one move; it is given up after it, s.
+        look_patience: for how long they go on looking for a robot that is not found, s.
+        found_std: standard deviation of its place against some other's, along the worst axis, up to
+            which a robot counts as found, m.
+        patience: of one move, beside the time that its way takes; it is given up after it, s.
+        pace: average speed by which that time is counted, m/s.
     """
 
     start_time: float = 0.2
     stop_time: float = 0.5
     look_time: float = 1.0
+    look_patience: float = 5.0
+    found_std: float = 0.1
     patience: float = 120.0
+    pace: float = 0.05
 
     def __post_init__(self) -> None:
         require_non_negative(
-            start_time=self.start_time, stop_time=self.stop_time, look_time=self.look_time
+            start_time=self.start_time,
+            stop_time=self.stop_time,
+            look_time=self.look_time,
+            look_patience=self.look_patience,
         )
-        require_positive(patience=self.patience)
+        require_positive(found_std=self.found_std, patience=self.patience, pace=self.pace)
 
 
 class FormationTurns(LeafSystem):
@@ -63,6 +84,7 @@ class FormationTurns(LeafSystem):
         input_ports:
         - move
         - poses
+        - covariance
         - failed
         - status_{k}
         output_ports:
@@ -85,22 +107,29 @@ class FormationTurns(LeafSystem):
         poses (input, vector of 3 N): [x, y, theta] of each robot in map, the estimate; unconnected,
             every robot is believed to stand exactly where its last move was to end, with the anchor
             behind it: that is how the paper's errors add up.
-        failed (input, vector of N): other than 0 for robots that cannot drive; unconnected: none.
-        status_{k} (input, vector of 2): of robot k's controller, k from 0.
-        task_{k} (output, vector of 17): its `StepTask`.
+        covariance (input, vector of 9 N N): of them, row by row; unconnected, all robots count as
+            found.
+        failed (input, vector of N): 0 for robots that can drive, 2 for those that are no beacons
+            either; unconnected: all can.
+        status_{k} (input, vector of 3): of robot k's controller, k from 0.
+        task_{k} (output, StepTask): its task; of its robots, all that stand where they are
+            believed to.
         moving (output, vector of N): 1 for the robot that moves, from before it sets out until it
             stands again.
         looking (output, vector of N): 1 for each robot whose cameras are needed: the mover's while
             it moves, everybody's while all stand and look.
         progress (output, vector of 2): number of the move, and 1 when it is done, -1 when it was
-            given up (its controller waits for too long, the robot has failed, or the planner has
-            something else in mind), else 0.
-        positions (output, vector of 2 N): x, y of the robots as they are believed to be.
-        believed (output, vector of 3 N): [x, y, theta] of the robots, likewise.
-        record (output, vector of 8): number of the last move that ended, its robot, its three
-            beacons, its target (2, m) and what became of it (1 or -1); zeros before the first.
+            given up (its controller took too long, the robot has failed, or the planner wants
+            something else), else 0.
+        positions (output, vector of 2 N): x, y of the robots as they are believed to be; NaN for
+            one that is looked for and not found.
+        believed (output, vector of 3 N): [x, y, theta] of the robots, likewise, but never NaN.
+        record (output, vector of 10): number of the last move that ended, its robot, its three
+            beacons, its target (2, m), what became of it (1 or -1), how often the robot stood and
+            waited, and its tries after the first; zeros before the first move.
         health (output, Health): `bad_pose`, looks at estimates that were not finite, for which
-            those before count; `given_up`, moves.
+            those before count; `given_up`, moves; `waits`, of all moves; `not_found`, robots that
+            all have looked for in vain.
 
     Raises:
         ValueError: fewer than four robots, poses that are not finite, or a rate out of range.
@@ -125,20 +154,28 @@ class FormationTurns(LeafSystem):
         )
         self._poses_input = self.DeclareVectorInputPort("poses", 3 * n)
         self._failed_input = self.DeclareVectorInputPort("failed", n)
-        self._status_inputs = [self.DeclareVectorInputPort(f"status_{k}", 2) for k in range(n)]
+        self._covariance_input = self.DeclareVectorInputPort("covariance", 9 * n * n)
+        self._status_inputs = [
+            self.DeclareVectorInputPort(f"status_{k}", STATUS_SIZE) for k in range(n)
+        ]
         self._belief = self.DeclareDiscreteState(poses.ravel())
         # Phase, since when (s), number of the move, its robot, what became of it.
         self._turn = self.DeclareDiscreteState([Phase.LOOK, 0.0, 0.0, -1.0, 0.0])
-        self._task = self.DeclareDiscreteState(OFF.vector())
-        self._record = self.DeclareDiscreteState(8)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._update)
+        # Of the present move: whether its robot waits, how often it did, its tries after the first.
+        self._effort = self.DeclareDiscreteState(3)
+        # Of each robot: whether it was not found; whether it gave up its last move.
+        self._missing = self.DeclareDiscreteState(n)
+        self._astray = self.DeclareDiscreteState(n)
+        self._task = self.DeclareAbstractState(AbstractValue.Make(OFF))
+        self._record = self.DeclareDiscreteState(RECORD_SIZE)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._update)
         turn = {self.discrete_state_ticket(self._turn)}
-        both = turn | {self.discrete_state_ticket(self._task)}
+        both = turn | {self.abstract_state_ticket(self._task)}
         self._task_outputs = [
-            self.DeclareVectorOutputPort(
+            self.DeclareAbstractOutputPort(
                 f"task_{k}",
-                TASK_SIZE,
-                lambda context, output, k=k: output.SetFromVector(self._task_of(context, k)),
+                lambda: AbstractValue.Make(OFF),
+                lambda context, output, k=k: output.set_value(self._task_of(context, k)),
                 both,
             )
             for k in range(n)
@@ -161,14 +198,12 @@ class FormationTurns(LeafSystem):
         self._positions_output = self.DeclareVectorOutputPort(
             "positions",
             2 * n,
-            lambda context, output: output.SetFromVector(
-                context.get_discrete_state(self._belief).get_value().reshape(n, 3)[:, :2].ravel()
-            ),
-            {self.discrete_state_ticket(self._belief)},
+            self._calc_positions,
+            {self.discrete_state_ticket(self._belief), self.discrete_state_ticket(self._missing)},
         )
         self._believed_output = self.DeclareStateOutputPort("believed", self._belief)
         self._record_output = self.DeclareStateOutputPort("record", self._record)
-        self._counts = Counts(self, "bad_pose", "given_up")
+        self._counts = Counts(self, "bad_pose", "given_up", "waits", "not_found")
 
     def move_input_port(self) -> InputPort:
         """Returns the port of the planner's moves."""
@@ -177,6 +212,10 @@ class FormationTurns(LeafSystem):
     def poses_input_port(self) -> InputPort:
         """Returns the port of the estimated poses."""
         return self._poses_input
+
+    def covariance_input_port(self) -> InputPort:
+        """Returns the port of their covariance."""
+        return self._covariance_input
 
     def failed_input_port(self) -> InputPort:
         """Returns the port of who has failed."""
@@ -225,12 +264,12 @@ class FormationTurns(LeafSystem):
         phase, _, _, mover, _ = context.get_discrete_state(self._turn).get_value()
         return Phase(int(phase)), int(mover)
 
-    def _task_of(self, context: Context, robot: int) -> Array:
+    def _task_of(self, context: Context, robot: int) -> StepTask:
         phase, mover = self._now(context)
         if phase == Phase.DRIVE and robot == mover:
-            task: Array = context.get_discrete_state(self._task).get_value()
+            task: StepTask = context.get_abstract_state(int(self._task)).get_value()
             return task
-        return OFF.vector()
+        return OFF
 
     def _moving(self, context: Context) -> Array:
         phase, mover = self._now(context)
@@ -243,36 +282,43 @@ class FormationTurns(LeafSystem):
         phase, _ = self._now(context)
         return np.ones(self._robots) if phase == Phase.LOOK else self._moving(context)
 
+    def _calc_positions(self, context: Context, output: Any) -> None:
+        poses = context.get_discrete_state(self._belief).get_value().reshape(-1, 3)
+        missing = context.get_discrete_state(self._missing).get_value()
+        output.SetFromVector(np.where(missing[:, None] > 0, np.nan, poses[:, :2]).ravel())
+
     def _calc_progress(self, context: Context, output: Any) -> None:
         phase, _, number, _, outcome = context.get_discrete_state(self._turn).get_value()
         output.SetFromVector([number, outcome if phase == Phase.READY else 0.0])
 
     # --- One look ---
 
-    def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
+    def _update(self, context: Context, state: State) -> EventStatus:
         p, t = self._parameters, context.get_time()
+        discrete_state: Any = state.get_mutable_discrete_state()
         phase, since, number, mover, outcome = context.get_discrete_state(self._turn).get_value()
         waited = t - since + 1e-9
         poses = self._believed(context, discrete_state)
         move: FormationMove = self._move_input.Eval(context)
         after: Phase | None = None
         if phase == Phase.LOOK and waited >= p.look_time:
-            after = Phase.READY
+            missing = self._not_found(context)
+            if not missing.any() or waited >= p.look_patience:
+                self._counts.add(context, discrete_state, not_found=int(missing.sum()))
+                discrete_state.set_value(self._missing, missing.astype(float))
+                after = Phase.READY
         elif phase == Phase.READY:
             if move.status == "moving" and move.number > number and move.mover >= 0:
                 number, mover, outcome, after = move.number, move.mover, 0.0, Phase.START
         elif phase == Phase.START and (move.number != number or move.status != "moving"):
             outcome, after = -1.0, Phase.LOOK  # it has not moved yet, and is looked at again
         elif phase == Phase.START and waited >= p.start_time:
-            robot = int(mover)
-            task = StepTask(
-                int(number), move.beacons, poses[move.beacons], move.target, poses[robot, :2]
-            )
-            discrete_state.set_value(self._task, task.vector())
+            slot: Any = state.get_mutable_abstract_state(int(self._task))
+            slot.set_value(task_of(move, poses, self._standing(context)))
+            discrete_state.set_value(self._effort, np.zeros(3))
             after = Phase.DRIVE
         elif phase == Phase.DRIVE:
-            outcome = -1.0 if move.number != number or move.status != "moving" else 0.0
-            outcome = outcome or self._outcome(context, int(mover), number, waited)
+            outcome = self._outcome(context, discrete_state, int(mover), move, waited)
             if outcome:
                 after = Phase.STOP
         elif phase == Phase.STOP and waited >= p.stop_time:
@@ -280,6 +326,24 @@ class FormationTurns(LeafSystem):
             after = Phase.LOOK
         if after is not None:
             discrete_state.set_value(self._turn, [after, t, number, mover, outcome])
+        return EventStatus.Succeeded()
+
+    def _standing(self, context: Context) -> NDArray[np.bool_]:
+        """Returns which robots stand where they are believed to be, if they do not move, (N,)."""
+        standing = context.get_discrete_state(self._missing).get_value() == 0
+        if self._failed_input.HasValue(context):
+            standing &= self._failed_input.Eval(context) != _NO_BEACON
+        if not self._poses_input.HasValue(context):
+            standing &= context.get_discrete_state(self._astray).get_value() == 0
+        return np.asarray(standing)
+
+    def _not_found(self, context: Context) -> NDArray[np.bool_]:
+        """Returns which robots are not known from any other, (N,)."""
+        if not self._covariance_input.HasValue(context):
+            return np.zeros(self._robots, bool)
+        size = 3 * self._robots
+        P = self._covariance_input.Eval(context).reshape(size, size)
+        return not_found(P, self._parameters.found_std)
 
     def _believed(self, context: Context, discrete_state: DiscreteValues) -> Array:
         """Returns the poses (N, 3) as they are believed to be, and remembers them."""
@@ -293,13 +357,29 @@ class FormationTurns(LeafSystem):
         discrete_state.set_value(self._belief, told.ravel())
         return np.asarray(told)
 
-    def _outcome(self, context: Context, mover: int, number: float, waited: float) -> float:
+    def _outcome(
+        self,
+        context: Context,
+        discrete_state: DiscreteValues,
+        mover: int,
+        move: FormationMove,
+        waited: float,
+    ) -> float:
         """Returns 1 when the present task is done, -1 when it is given up, else 0."""
-        done = self._status_inputs[mover].Eval(context)
-        if done[0] == number and done[1] == Status.DONE:
-            return 1.0
+        task: StepTask = context.get_abstract_state(int(self._task)).get_value()
+        number, status, tries = self._status_inputs[mover].Eval(context)
+        if number == task.number:
+            was_waiting, waits, _ = context.get_discrete_state(self._effort).get_value()
+            waiting = status == Status.WAITING
+            begun = waiting and not was_waiting
+            self._counts.add(context, discrete_state, waits=begun)
+            discrete_state.set_value(self._effort, [waiting, waits + begun, tries])
+            if status == Status.DONE:
+                return 1.0
         failed = self._failed_input.HasValue(context) and self._failed_input.Eval(context)[mover]
-        return -1.0 if failed or waited >= self._parameters.patience else 0.0
+        late = waited >= self._parameters.patience + way_length(task) / self._parameters.pace
+        changed = move.number != task.number or move.status != "moving"
+        return -1.0 if failed or late or changed else 0.0
 
     def _end(
         self,
@@ -310,10 +390,13 @@ class FormationTurns(LeafSystem):
         outcome: float,
     ) -> None:
         """Notes a move that has ended."""
-        task = StepTask.from_vector(context.get_discrete_state(self._task).get_value())
-        assert task is not None
-        record = [task.number, mover, *task.beacons, *task.target, outcome]
+        task: StepTask = context.get_abstract_state(int(self._task)).get_value()
+        _, waits, tries = context.get_discrete_state(self._effort).get_value()
+        record = [task.number, mover, *task.beacons, *task.target, outcome, waits, tries]
         discrete_state.set_value(self._record, record)
+        astray = context.get_discrete_state(self._astray).get_value().copy()
+        astray[mover] = outcome < 0
+        discrete_state.set_value(self._astray, astray)
         if outcome < 0:
             self._counts.add(context, discrete_state, given_up=1)
         elif not self._poses_input.HasValue(context):
@@ -321,3 +404,6 @@ class FormationTurns(LeafSystem):
             moved = poses.copy()
             moved[mover] = [*task.target, math.remainder(float(heading), 2 * math.pi)]
             discrete_state.set_value(self._belief, moved.ravel())
+
+
+_NO_BEACON = 2.0  # as `failed` says it

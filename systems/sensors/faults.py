@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -17,7 +17,9 @@ from systems.noise import NoiseStream, sample_index
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
-Kind = Literal["silent", "frozen", "nan", "garbled", "unknown_ids"]
+Kind = Literal[
+    "silent", "frozen", "nan", "garbled", "dead", "unknown_ids", "hidden", "misread"
+]  # fmt: skip
 
 _NO_SUCH_ID = 1_000_000  # no family has so many
 _RUBBISH = 1e3  # magnitude of numbers that no sensor gives
@@ -25,11 +27,12 @@ _RATE = 100.0  # Hz, at which what came last is remembered
 
 _KINDS: dict[type, tuple[Kind, ...]] = {
     CameraImage: ("silent", "frozen", "garbled"),
-    Detections: ("silent", "frozen", "nan", "garbled", "unknown_ids"),
+    Detections: ("silent", "frozen", "nan", "garbled", "unknown_ids", "hidden", "misread"),
     PointMatches: ("silent", "frozen", "nan", "garbled"),
     Scan: ("silent", "frozen", "nan", "garbled"),
-    int: ("frozen", "nan", "garbled"),  # a vector
+    int: ("frozen", "nan", "garbled", "dead"),  # a vector
 }
+_OF_MARKERS = ("hidden", "misread")
 
 
 @dataclass
@@ -39,24 +42,42 @@ class Fault:
     Attributes:
         signal: port of the device, such as `imu.sample` or `front_camera.detections`.
         kind: `silent`, no new message comes; `frozen`, the last one comes again and again, under
-            new stamps; `nan`, every measured number is NaN; `garbled`, they are rubbish;
-            `unknown_ids`, markers are taken for others that do not exist.
+            new stamps; `nan`, every measured number is NaN; `garbled`, they are rubbish; `dead`,
+            they are 0; `unknown_ids`, markers are taken for others that do not exist; `hidden`,
+            they are not found; `misread`, they are taken for others that do.
         start: time of the first bad sample, s.
         duration: how long it lasts, s; for ever, if left out.
+        ids: which markers are hidden or misread; all, if left out.
+        id_offset: what is added to the ids of markers that are misread.
     """
 
     signal: str
     kind: Kind
     start: float = 0.0
     duration: float = math.inf
+    ids: list[int] = field(default_factory=list)
+    id_offset: int = 0
 
     def __post_init__(self) -> None:
         require_non_negative(start=self.start)
         require(self.duration > 0, "duration", self.duration, "greater than 0")
+        of_markers = self.kind in _OF_MARKERS
+        require(of_markers or not self.ids, "ids", self.ids, "left out, unless hidden or misread")
+        fits = (self.id_offset != 0) == (self.kind == "misread")
+        allowed = "other than 0 for markers that are misread, and left out otherwise"
+        require(fits, "id_offset", self.id_offset, allowed)
 
     def covers(self, t: float) -> bool:
         """Whether a sample of time t (s) is bad; a message that has no stamp yet never is."""
         return self.start <= t < self.start + self.duration
+
+
+def tamper(detections: Detections, fault: Fault) -> Detections:
+    """Returns what is found when markers are hidden or misread."""
+    meant = np.isin(detections.ids, fault.ids) if fault.ids else np.ones(len(detections), bool)
+    if fault.kind == "hidden":
+        return detections.select(~meant)
+    return replace(detections, ids=detections.ids + meant * fault.id_offset)
 
 
 def kinds_for(model: Any) -> tuple[Kind, ...]:
@@ -102,8 +123,8 @@ def spoil(value: Any, kind: Kind, held: Any, random: np.random.Generator) -> Any
 def _spoil_vector(value: Array, kind: Kind, held: Any, random: np.random.Generator) -> Array:
     if kind == "frozen":
         return np.asarray(held, float)
-    if kind == "nan":
-        return np.full_like(value, np.nan)
+    if kind in ("nan", "dead"):
+        return np.full_like(value, np.nan if kind == "nan" else 0.0)
     rubbish = random.uniform(-_RUBBISH, _RUBBISH, len(value))
     special = random.choice([np.nan, np.inf, -np.inf, 0.0], len(value))
     return np.where(random.random(len(value)) < 0.3, special, rubbish)
@@ -182,6 +203,8 @@ class FaultInjector(LeafSystem):
         fault = self._fault(context, value)
         if fault is None:
             return value
+        if fault.kind in _OF_MARKERS:
+            return tamper(value, fault)
         held = context.get_abstract_state(int(self._held)).get_value()
         index = sample_index(getattr(value, "stamp", context.get_time()), self._rate)
         return spoil(value, fault.kind, held, self._noise.generator(context, index))

@@ -5,18 +5,19 @@ from functools import cache
 
 import numpy as np
 import pytest
+from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 
 from systems.cameras import PinholeCamera
 from systems.controllers.formation_step import (
     FormationStep,
     FormationStepParameters,
-    Status,
-    StepTask,
     view,
 )
+from systems.controllers.step_localizer import ResectionTrustParameters
+from systems.controllers.step_task import Status
 from systems.controllers.triangle_algorithm1 import TriangleAlgorithm1
-from systems.controllers.triangle_resection import ResectionTrustParameters, TriangleResection
+from systems.controllers.triangle_resection import TriangleResection
 from systems.formation.bearing_filter import BearingFilterParameters
 from systems.messages import Detections
 from tests.triangle_step import CAMERA, STARTS, Run, World, picture, run_step
@@ -85,7 +86,7 @@ def test_it_keeps_clear_of_the_beacons() -> None:
 
 def test_resection_corrects_a_start_that_is_not_where_it_is_believed() -> None:
     world = World(poses=STARTS + np.array([[0, 0, 0], [0.05, -0.06, 2.0], [0, 0, 0], [0, 0, 0]]))
-    task = world.task()._replace(start=np.array([0.0, 1.3]))
+    task = replace(world.task(), start=np.array([0.0, 1.3]))
     run = run_step(block(TriangleResection), world, task=task)
     assert run.statuses[-1] == Status.DONE
     assert math.hypot(run.along, run.aside) < 0.005
@@ -172,10 +173,10 @@ def test_old_pictures_are_counted_and_not_looked_at(kind: type) -> None:
 def test_bad_and_absent_tasks_leave_it_standing(kind: type) -> None:
     task = World().task()
     for bad in (
-        task._replace(beacons=np.array([2, 2, 0])),
-        task._replace(beacons=np.array([2, -3, 0])),
-        task._replace(number=math.nan),
-        task._replace(number=0),
+        replace(task, beacons=np.array([2, 2, 0])),
+        replace(task, beacons=np.array([2, -3, 0])),
+        replace(task, number=math.nan),
+        replace(task, number=0),
     ):
         run = run_step(block(kind), World(), limit=1.0, task=bad)
         assert run.statuses == [Status.IDLE]
@@ -194,19 +195,14 @@ def test_a_new_number_begins_anew(kind: type) -> None:
     seen = []
     # Half a minute without a beacon, then none to do, then another step.
     for number, t in ((1, 23.5), (0, 24.0), (2, 24.5)):
-        system.task_input_port().FixValue(context, task._replace(number=number).vector())
+        system.task_input_port().FixValue(context, AbstractValue.Make(replace(task, number=number)))
         simulator.AdvanceTo(t)
         seen.append(status.Eval(context).tolist())
-    assert seen == [[1, Status.WAITING], [0, Status.IDLE], [2, Status.APPROACH]]
-
-
-def test_a_task_is_a_vector_and_back() -> None:
-    task = World().task(number=7)
-    back = StepTask.from_vector(task.vector())
-    assert back is not None
-    assert back.number == 7
-    for name in ("beacons", "poses", "target", "start"):
-        assert np.array_equal(getattr(back, name), getattr(task, name))
+    assert [row[:2] for row in seen] == [
+        [1, Status.WAITING],
+        [0, Status.IDLE],
+        [2, Status.APPROACH],
+    ]
 
 
 def test_a_view_drops_what_is_no_reading() -> None:

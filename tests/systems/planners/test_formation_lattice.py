@@ -27,6 +27,13 @@ def test_the_paper_s_start_is_a_rhombus_of_four() -> None:
     np.testing.assert_allclose(strip(4, 1.5), PAPER, atol=1e-3)
 
 
+def test_more_robots_stand_behind_the_papers_four() -> None:
+    places = strip(7, 1.5)
+    np.testing.assert_allclose(places[:4], PAPER, atol=1e-3)
+    behind = [[-0.75, 0.0], [-1.5, 1.299], [-2.25, 0.0]]
+    np.testing.assert_allclose(places[4:], behind, atol=1e-3)
+
+
 def test_two_steps_of_the_lattice_are_sixty_degrees_apart() -> None:
     lattice = TriangleLattice((1.0, 2.0), math.radians(90.0), 2.0)
     places = lattice.positions(np.array([[0, 0], [1, 0], [0, 1]]))

@@ -230,6 +230,30 @@ def test_who_gives_up_goes_elsewhere_or_another_goes() -> None:
     assert world.go_on() == "reached"
 
 
+def test_who_is_not_found_where_it_should_be_is_no_beacon() -> None:
+    """Before the next move: it is not built upon, and goes on when it has been found."""
+    world = World(strip(6, 1.5))
+    move = world.look()
+    world.drive()
+    where = world.places[move.mover].copy()
+    world.places[move.mover] = math.nan
+    again = world.look(outcome=1)
+    assert world.memory.unplaced == 1
+    assert again.status == "moving"
+    assert move.mover not in (again.mover, *again.beacons)
+    world.places[move.mover] = where
+    assert world.go_on() == "reached"
+    assert world.memory.unplaced == 1
+
+
+def test_of_four_none_may_be_missing() -> None:
+    world = World(strip(4, 1.5))
+    move = world.look()
+    world.drive()
+    world.places[move.mover] = math.nan
+    assert world.look(outcome=1).status == "blocked"
+
+
 def test_what_turns_up_in_the_way_turns_the_robot_back() -> None:
     world = World(strip(4, 1.5), rule="closest")
     move = world.look()

@@ -11,9 +11,10 @@ import pytest
 from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 
-from systems.controllers.formation_step import Status, StepTask
+from systems.controllers.step_task import Status, StepTask
 from systems.planners.formation_lattice import strip
 from systems.planners.formation_planner import FormationMove
+from systems.planners.formation_tasks import not_found
 from systems.planners.formation_turns import FormationTurns, FormationTurnsParameters
 
 Array = NDArray[np.float64]
@@ -21,9 +22,12 @@ Array = NDArray[np.float64]
 START = np.column_stack([strip(4, 1.5), np.zeros(4)])
 TARGET = np.array([3.0, 1.299])
 MOVE = FormationMove(
-    stamp=0.0, status="moving", number=1, mover=1, beacons=np.array([2, 3, 0]), target=TARGET
+    stamp=0.0, status="moving", number=1, mover=1, beacons=np.array([2, 3, 0]), target=TARGET,
+    points=np.array([[1.125, 0.65], [1.875, 0.65], TARGET]),
+)  # fmt: skip
+TIMES = FormationTurnsParameters(
+    start_time=0.2, stop_time=0.5, look_time=1.0, patience=5.0, pace=10.0
 )
-TIMES = FormationTurnsParameters(start_time=0.2, stop_time=0.5, look_time=1.0, patience=5.0)
 
 
 class Rig:
@@ -40,8 +44,8 @@ class Rig:
             self.block.poses_input_port().FixValue(self.context, START.ravel())
         self.k = 0
 
-    def status(self, robot: int, number: int, status: Status) -> None:
-        self.block.status_input_port(robot).FixValue(self.context, [number, status])
+    def status(self, robot: int, number: int, status: Status, tries: int = 0) -> None:
+        self.block.status_input_port(robot).FixValue(self.context, [number, status, tries])
 
     def move(self, move: FormationMove) -> None:
         self.block.move_input_port().FixValue(self.context, move)
@@ -54,8 +58,7 @@ class Rig:
         return self.block.GetOutputPort(name).Eval(self.context).copy()
 
     def task(self, robot: int) -> StepTask:
-        task = StepTask.from_vector(self.output(f"task_{robot}"))
-        assert task is not None
+        task: StepTask = self.block.task_output_port(robot).Eval(self.context)
         return task
 
 
@@ -96,6 +99,73 @@ def test_the_task_says_who_stands_where() -> None:
     np.testing.assert_allclose(task.start, START[1, :2])
 
 
+def test_the_task_says_by_which_way_and_who_else_stands() -> None:
+    poses = np.column_stack([strip(6, 1.5), np.zeros(6)])
+    block = FormationTurns(start_poses=poses, parameters=TIMES)
+    simulator = Simulator(block)
+    context = simulator.get_mutable_context()
+    block.move_input_port().FixValue(context, MOVE)
+    block.failed_input_port().FixValue(context, [0, 0, 0, 0, 1, 2])
+    for k in range(6):
+        block.status_input_port(k).FixValue(context, [0, 0, 0])
+    simulator.AdvanceTo(2.05)
+    task: StepTask = block.task_output_port(1).Eval(context)
+    np.testing.assert_allclose(task.points, MOVE.points[:-1])
+    np.testing.assert_array_equal(task.others, [4])  # 5 is no beacon any more
+    np.testing.assert_allclose(task.other_poses, poses[[4]])
+
+
+def test_waits_and_tries_are_written_down() -> None:
+    rig = driving(Rig())
+    for status, tries in (
+        (Status.WAITING, 0), (Status.APPROACH, 1), (Status.WAITING, 1), (Status.BUILD, 2),
+    ):  # fmt: skip
+        rig.status(1, 1, status, tries)
+        rig.wait(0.5)
+    rig.status(1, 1, Status.DONE, 2)
+    rig.wait(2.0)
+    np.testing.assert_allclose(rig.output("record")[7:], [1, 2, 2])
+    assert rig.block.health_output_port().Eval(rig.context).counts["waits"] == 2
+
+
+def test_a_planner_that_thinks_again_calls_the_robot_back() -> None:
+    rig = driving(Rig())
+    rig.move(FormationMove(stamp=2.0, status="moving", number=2, mover=2, beacons=MOVE.beacons))
+    rig.wait(0.2)
+    assert rig.task(1).number == 0
+    rig.wait(0.6)
+    np.testing.assert_allclose(rig.output("record")[[0, 7]], [1, -1])
+
+
+@pytest.mark.parametrize("lost", [False, True])
+def test_a_robot_that_is_not_found_is_looked_for_and_then_said_to_be_nowhere(lost: bool) -> None:
+    rig = Rig(estimate=True)
+    P = np.eye(12) * 1e-4
+    rig.block.covariance_input_port().FixValue(rig.context, P.ravel())
+    driving(rig)
+    rig.status(1, 1, Status.DONE)
+    P[3, 3] = P[4, 4] = 900.0
+    rig.block.covariance_input_port().FixValue(rig.context, P.ravel())
+    rig.wait(3.0)
+    np.testing.assert_array_equal(rig.output("progress"), [1, 0])
+    np.testing.assert_array_equal(rig.output("looking"), [1, 1, 1, 1])  # longer than look_time
+    if not lost:
+        P[3, 3] = P[4, 4] = 1e-4
+        rig.block.covariance_input_port().FixValue(rig.context, P.ravel())
+    rig.wait(3.0)
+    np.testing.assert_array_equal(rig.output("progress"), [1, 1])
+    known = np.isfinite(rig.output("positions").reshape(4, 2)).all(axis=1)
+    np.testing.assert_array_equal(known, [True, not lost, True, True])
+    assert rig.block.health_output_port().Eval(rig.context).counts["not_found"] == int(lost)
+
+
+def test_found_is_who_is_known_from_another_however_far_from_the_start() -> None:
+    far = np.full((12, 12), 4.0) + 1e-4 * np.eye(12)  # all share what is not known
+    assert not not_found(far, 0.1).any()
+    alone = far + np.diag([0, 0, 0, 0.05, 0, 0, 0, 0, 0, 0, 0, 0])
+    np.testing.assert_array_equal(not_found(alone, 0.1), [False, True, False, False])
+
+
 def test_a_move_that_is_done_is_reported_after_all_have_looked() -> None:
     rig = driving(Rig())
     rig.status(1, 1, Status.DONE)
@@ -107,7 +177,7 @@ def test_a_move_that_is_done_is_reported_after_all_have_looked() -> None:
     np.testing.assert_array_equal(rig.output("progress"), [1, 0])
     rig.wait(1.0)
     np.testing.assert_array_equal(rig.output("progress"), [1, 1])
-    np.testing.assert_allclose(rig.output("record"), [1, 1, 2, 3, 0, *TARGET, 1])
+    np.testing.assert_allclose(rig.output("record"), [1, 1, 2, 3, 0, *TARGET, 1, 0, 0])
 
 
 def test_without_an_estimate_the_robot_is_believed_to_be_where_it_was_to_go() -> None:

@@ -165,11 +165,41 @@ def test_unknown_ids_are_of_no_family() -> None:
         assert (found[k].corners == 10.0 * k).all()
 
 
+def test_hidden_markers_are_not_found_and_the_others_are() -> None:
+    one = outputs(detections, Fault("a.signal", "hidden", BAD[0] / RATE, 0.4, ids=[7]))
+    for k in range(12):
+        assert one[k].ids.tolist() == ([3] if k in BAD else [3, 7])
+        assert one[k].corners.shape == (len(one[k].ids), 4, 2)
+    assert all(len(outputs(detections, fault("hidden"))[k]) == 0 for k in BAD)
+
+
+def test_misread_markers_keep_their_corners_under_another_id() -> None:
+    found = outputs(detections, Fault("a.signal", "misread", BAD[0] / RATE, 0.4, [3], 4))
+    for k in range(12):
+        assert found[k].ids.tolist() == ([7, 7] if k in BAD else [3, 7])
+        assert (found[k].corners == 10.0 * k).all()
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({"kind": "misread"}, "id_offset is 0: must be other than 0"),
+        ({"kind": "hidden", "id_offset": 4}, "id_offset is 4: must be .* left out otherwise"),
+        ({"kind": "nan", "ids": [3]}, r"ids is \[3\]: must be left out, unless hidden or misread"),
+    ],
+)
+def test_marker_faults_that_make_no_sense_are_refused(more: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        Fault("front_camera.detections", **more)
+
+
 def test_vectors_go_by_time() -> None:
     found = outputs(None, fault("frozen"))
     assert [int(v[0]) for v in found] == [0, 1, 2, 2, 2, 2, 2, 7, 8, 9, 10, 11]
     found = outputs(None, fault("nan"))
     assert [bool(np.isnan(v).all()) for v in found] == [k in BAD for k in range(12)]
+    found = outputs(None, fault("dead"))
+    assert [bool((v == 0).all()) for v in found[1:]] == [k in BAD for k in range(1, 12)]
     found = outputs(None, fault("garbled"))
     assert [bool((v == k).all()) for k, v in enumerate(found)] == [k not in BAD for k in range(12)]
 
@@ -183,10 +213,11 @@ def test_the_first_of_two_at_one_time_counts_and_one_without_an_end_stays() -> N
 @pytest.mark.parametrize(
     ("model", "kind", "allowed"),
     [
-        (6, "silent", "frozen or nan or garbled"),
-        (6, "unknown_ids", "frozen or nan or garbled"),
+        (6, "silent", "frozen or nan or garbled or dead"),
+        (6, "unknown_ids", "frozen or nan or garbled or dead"),
         (CameraImage(), "nan", "silent or frozen or garbled"),
         (Scan(), "unknown_ids", "silent or frozen or nan or garbled"),
+        (Scan(), "hidden", "silent or frozen or nan or garbled"),
     ],
 )
 def test_kinds_that_a_signal_cannot_have_are_refused(model: Any, kind: Any, allowed: str) -> None:
