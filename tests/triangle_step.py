@@ -47,35 +47,44 @@ class World:
     Attributes:
         mover: number of the robot that moves; the others stand.
         order: numbers of beacons 1, 2, 3.
-        poses: (4, 3) true poses at the start.
+        points: (n, 2) centre points of a way that is longer than entry and exit, m.
+        poses: (N, 3) true poses at the start.
         marker_size: m.
         corner_noise: px.
         centre_bias: px, of both cameras.
         latency: s.
         wheel_scale: of distance and of angle.
+        dead: from when to when the motors stand still, s.
         tamper: changes the detections of a picture: time, whether from the rear camera, detections.
     """
 
     mover: int = 1
     order: tuple[int, int, int] = (2, 3, 0)
+    points: Array = field(default_factory=lambda: np.zeros((0, 2)))
     poses: Array = field(default_factory=STARTS.copy)
     marker_size: float = 0.10
     corner_noise: float = 0.5
     centre_bias: float = 0.0
     latency: float = 0.2
     wheel_scale: tuple[float, float] = (1.0, 1.0)
+    dead: tuple[float, float] = (0.0, 0.0)
     tamper: Tamper = lambda _, __, detections: detections
 
     def task(self, number: int = 1) -> StepTask:
         """Returns the step from here to the next vertex, all that is believed being true."""
         poses = self.poses[list(self.order)]
         target = next_vertex(poses[:, :2])
-        return StepTask(number, np.array(self.order), poses, target, self.poses[self.mover, :2])
+        beacons, start = np.array(self.order), self.poses[self.mover, :2]
+        others = np.setdiff1d(np.arange(len(self.poses)), [self.mover, *self.order])
+        return StepTask(
+            number, beacons, poses, target, start, self.points, others, self.poses[others]
+        )
 
     def mirrored(self) -> World:
         """Returns the same world seen in a mirror along the x axis."""
         mirrored = World(**vars(self))
         mirrored.poses = self.poses * [1.0, -1.0, -1.0]
+        mirrored.points = self.points * [1.0, -1.0]
         return mirrored
 
 
@@ -165,7 +174,8 @@ def run_step(
         path.append(pose)
         if status == Status.DONE:
             break
-        pose = moved(pose, command * world.wheel_scale * dt)
+        dead = world.dead[0] <= t < world.dead[1]
+        pose = moved(pose, command * world.wheel_scale * dt * (not dead))
     heading = arrival_heading(task.target, task.poses[2, :2])
     along, aside = components(pose[:2] - task.target, heading)
     health = dict(system.health_output_port().Eval(context).counts)

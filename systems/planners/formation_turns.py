@@ -153,8 +153,8 @@ class FormationTurns(LeafSystem):
             "move", AbstractValue.Make(FormationMove())
         )
         self._poses_input = self.DeclareVectorInputPort("poses", 3 * n)
-        self._failed_input = self.DeclareVectorInputPort("failed", n)
         self._covariance_input = self.DeclareVectorInputPort("covariance", 9 * n * n)
+        self._failed_input = self.DeclareVectorInputPort("failed", n)
         self._status_inputs = [
             self.DeclareVectorInputPort(f"status_{k}", STATUS_SIZE) for k in range(n)
         ]

@@ -77,6 +77,70 @@ def test_resection_settles_within_millimetres(mirrored: bool) -> None:
     assert not any(run.health.values())
 
 
+# Two more robots behind the paper's four; the last one goes to the front.
+SIX = np.vstack([STARTS, [[-0.75, 0.0, 0.0], [-1.5, 1.30, 0.0]]])
+POINTS = np.array([[x, 0.65] for x in (-0.375, 0.375, 1.125, 1.875)])
+
+
+def long_way(**more: object) -> World:
+    return World(mover=5, poses=SIX.copy(), points=POINTS, **more)  # type: ignore[arg-type]
+
+
+@both
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_a_long_way_leads_through_every_triangle_to_the_vertex(kind: type, mirrored: bool) -> None:
+    world = long_way(wheel_scale=(1.02, 0.97))
+    world = world.mirrored() if mirrored else world
+    run = run_step(block(kind), world)
+    assert run.statuses == WAY
+    within = 0.106 if kind is TriangleAlgorithm1 else 0.004
+    assert math.hypot(run.along, run.aside) < within
+    for point in world.points:
+        assert np.linalg.norm(run.path[:, :2] - point, axis=1).min() < 0.1
+    others = np.delete(world.poses[:, :2], 5, axis=0)
+    assert np.linalg.norm(run.path[:, None, :2] - others, axis=2).min() > 0.5
+    assert run.health["retries"] == 0
+
+
+def test_robots_beside_the_way_tell_where_one_is() -> None:
+    """None of the step's own beacons can be seen until it is among them."""
+
+    def tamper(time: float, _: bool, seen: Detections) -> Detections:
+        return seen.select(~np.isin(seen.ids // 4, [0, 2, 3])) if time < 12.0 else seen
+
+    world = long_way(tamper=tamper)
+    alone = replace(world.task(), others=np.zeros(0, np.int64), other_poses=np.zeros((0, 3)))
+    helped = run_step(block(TriangleResection), world, limit=12.0)
+    unaided = run_step(block(TriangleResection), world, limit=12.0, task=alone)
+    assert helped.statuses == [Status.APPROACH, Status.PASS]
+    np.testing.assert_allclose(helped.path[-1, 1], 0.65, atol=0.02)
+    assert unaided.statuses == [Status.APPROACH]
+    assert np.ptp(unaided.path[:, :2], axis=0).max() == 0.0  # it turns round and looks
+
+
+@both
+def test_who_is_not_where_the_task_says_finds_out(kind: type) -> None:
+    """Given up halfway before: it stands inside the formation, not at its vertex."""
+    poses = SIX.copy()
+    poses[5] = [0.2, 0.75, 0.4]
+    world = long_way()
+    world.poses = poses
+    task = replace(world.task(), start=np.array([-1.5, 1.30]))
+    run = run_step(block(kind), world, task=task)
+    assert run.statuses[-1] == Status.DONE
+    assert math.hypot(run.along, run.aside) < (0.106 if kind is TriangleAlgorithm1 else 0.004)
+
+
+def test_motors_that_are_dead_for_a_time_are_noticed_and_waited_for() -> None:
+    world = long_way(dead=(10.0, 25.0))
+    run = run_step(block(TriangleResection), world)
+    assert run.statuses[-1] == Status.DONE
+    assert Status.WAITING in run.statuses
+    assert run.health["relocated"] >= 1
+    assert run.health["retries"] >= 1
+    assert math.hypot(run.along, run.aside) < 0.004
+
+
 def test_it_keeps_clear_of_the_beacons() -> None:
     run = undisturbed(TriangleAlgorithm1)
     beacons = STARTS[[0, 2, 3], :2]
