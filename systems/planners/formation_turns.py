@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -298,13 +299,14 @@ class FormationTurns(LeafSystem):
         discrete_state: Any = state.get_mutable_discrete_state()
         phase, since, number, mover, outcome = context.get_discrete_state(self._turn).get_value()
         waited = t - since + 1e-9
-        poses = self._believed(context, discrete_state)
+        counts: Counter[str] = Counter()
+        poses = self._believed(context, discrete_state, counts)
         move: FormationMove = self._move_input.Eval(context)
         after: Phase | None = None
         if phase == Phase.LOOK and waited >= p.look_time:
             missing = self._not_found(context)
             if not missing.any() or waited >= p.look_patience:
-                self._counts.add(context, discrete_state, not_found=int(missing.sum()))
+                counts["not_found"] += int(missing.sum())
                 discrete_state.set_value(self._missing, missing.astype(float))
                 after = Phase.READY
         elif phase == Phase.READY:
@@ -318,14 +320,16 @@ class FormationTurns(LeafSystem):
             discrete_state.set_value(self._effort, np.zeros(3))
             after = Phase.DRIVE
         elif phase == Phase.DRIVE:
-            outcome = self._outcome(context, discrete_state, int(mover), move, waited)
+            outcome = self._outcome(context, discrete_state, int(mover), move, waited, counts)
             if outcome:
                 after = Phase.STOP
         elif phase == Phase.STOP and waited >= p.stop_time:
             self._end(context, discrete_state, poses, int(mover), outcome)
+            counts["given_up"] += outcome < 0
             after = Phase.LOOK
         if after is not None:
             discrete_state.set_value(self._turn, [after, t, number, mover, outcome])
+        self._counts.add(context, discrete_state, **counts)
         return EventStatus.Succeeded()
 
     def _standing(self, context: Context) -> NDArray[np.bool_]:
@@ -345,14 +349,16 @@ class FormationTurns(LeafSystem):
         P = self._covariance_input.Eval(context).reshape(size, size)
         return not_found(P, self._parameters.found_std)
 
-    def _believed(self, context: Context, discrete_state: DiscreteValues) -> Array:
+    def _believed(
+        self, context: Context, discrete_state: DiscreteValues, counts: Counter[str]
+    ) -> Array:
         """Returns the poses (N, 3) as they are believed to be, and remembers them."""
         poses = context.get_discrete_state(self._belief).get_value().reshape(-1, 3)
         if not self._poses_input.HasValue(context):
             return poses
         told = self._poses_input.Eval(context).reshape(-1, 3)
         if not np.isfinite(told).all():
-            self._counts.add(context, discrete_state, bad_pose=1)
+            counts["bad_pose"] += 1
             return poses
         discrete_state.set_value(self._belief, told.ravel())
         return np.asarray(told)
@@ -364,6 +370,7 @@ class FormationTurns(LeafSystem):
         mover: int,
         move: FormationMove,
         waited: float,
+        counts: Counter[str],
     ) -> float:
         """Returns 1 when the present task is done, -1 when it is given up, else 0."""
         task: StepTask = context.get_abstract_state(int(self._task)).get_value()
@@ -372,7 +379,7 @@ class FormationTurns(LeafSystem):
             was_waiting, waits, _ = context.get_discrete_state(self._effort).get_value()
             waiting = status == Status.WAITING
             begun = waiting and not was_waiting
-            self._counts.add(context, discrete_state, waits=begun)
+            counts["waits"] += int(begun)
             discrete_state.set_value(self._effort, [waiting, waits + begun, tries])
             if status == Status.DONE:
                 return 1.0
@@ -397,9 +404,7 @@ class FormationTurns(LeafSystem):
         astray = context.get_discrete_state(self._astray).get_value().copy()
         astray[mover] = outcome < 0
         discrete_state.set_value(self._astray, astray)
-        if outcome < 0:
-            self._counts.add(context, discrete_state, given_up=1)
-        elif not self._poses_input.HasValue(context):
+        if outcome > 0 and not self._poses_input.HasValue(context):
             heading = arrival_heading(task.target, poses[task.beacons[2], :2])
             moved = poses.copy()
             moved[mover] = [*task.target, math.remainder(float(heading), 2 * math.pi)]

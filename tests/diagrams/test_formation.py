@@ -86,8 +86,8 @@ def log_of(errors: Any) -> FormationLog:
     truth[:, :, :2] = strip(4, 1.5)
     vertex = next_vertex(truth[0, [2, 3, 0], :2])
     truth[1:, 1, :2] = vertex + np.asarray(errors)
-    record = np.zeros((3, 8))
-    record[1:] = [1, 1, 2, 3, 0, *vertex, 1]
+    record = np.zeros((3, 10))
+    record[1:] = [1, 1, 2, 3, 0, *vertex, 1, 2, 1]
     return FormationLog(np.arange(3.0), record, truth, truth[:, :, :2], None, None)
 
 
@@ -100,6 +100,7 @@ def test_errors_are_split_along_and_across_the_way_from_the_anchor() -> None:
     assert metrics["lateral_error_mm"] == pytest.approx(0.0, abs=1e-9)
     assert metrics["destination_error_m"] == pytest.approx(0.03)
     assert metrics["broken"] is False
+    assert (metrics["waits"], metrics["retries"], metrics["replans"]) == (2, 1, 0)
 
 
 def test_a_side_far_too_long_breaks_the_formation() -> None:
