@@ -40,7 +40,9 @@ RESULTS = (
     "moves.json",
 )
 
-_MAX_STEP = 0.01  # s, of the integrator; only kinematic twins have continuous state
+# s, of the integrator; only kinematic twins have continuous state. Steps end at every event, and at
+# 0.3 m/s and 1 rad/s the longest is 3 micrometres wrong.
+_MAX_STEP = 0.05
 
 
 @dataclass(frozen=True)

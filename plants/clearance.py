@@ -109,7 +109,7 @@ class ClearanceMonitor(LeafSystem):
         self._contacts_output = self.DeclareVectorOutputPort(
             "contacts", 1, self._calc_contacts, {self.discrete_state_ticket(self._state)}
         )
-        if count:
+        if count > 0:
             self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
 
     def pose_input_port(self) -> InputPort:

@@ -323,15 +323,14 @@ def KinematicDifferentialDrive_(T: Any) -> Any:  # noqa: D103 - the class carrie
             """Returns the port of the velocity."""
             return self._velocity_output
 
-        def _velocity(self, context: Any) -> np.ndarray:
-            return np.array(body_velocity(self._wheel_speeds_input.Eval(context), self.parameters))
+        def _velocity(self, context: Any) -> list[Any]:
+            wheel_speeds = self._wheel_speeds_input.Eval(context).tolist()
+            return body_velocity(wheel_speeds, self.parameters)
 
         def DoCalcTimeDerivatives(self, context: Any, derivatives: Any) -> None:
             theta = context.get_continuous_state_vector().GetAtIndex(2)
             v, omega = self._velocity(context)
-            derivatives.get_mutable_vector().SetFromVector(
-                np.array([v * cos(theta), v * sin(theta), omega])
-            )
+            derivatives.get_mutable_vector().SetFromVector([v * cos(theta), v * sin(theta), omega])
 
     return Impl
 

@@ -49,7 +49,7 @@ class DifferentialDriveBody:
 
     def to_wheel_speeds(self, command: np.ndarray) -> list[float]:
         """Returns [right, left] (rad/s) of a command [v, omega]."""
-        return wheel_speeds(command, self.parameters)
+        return wheel_speeds(command.tolist(), self.parameters)
 
     def add_model(self, station: StationBuilder, robot: Robot) -> None:
         """Adds the robot to the plant, at its start.

@@ -90,14 +90,12 @@ NOTHING = View(math.nan, False, np.zeros(0, np.int64), np.zeros((0, 4, 2)), 0)
 
 def view(detections: Detections, robots: NDArray[np.int64], camera: PinholeCamera) -> View:
     """Returns what detections show of some robots; none of an id that was found twice."""
-    ids, found = np.asarray(detections.ids), np.isin(detections.ids // SIDES, robots)
-    counts = Counter(ids.tolist())
-    sound = np.array([counts[k] == 1 for k in ids.tolist()], bool)
-    sound &= np.isfinite(detections.corners).all(axis=(1, 2))
-    strange = int((found & ~sound).sum())
-    corners = detections.corners[found & sound]
-    rays = camera.undistort(corners) if len(corners) else NOTHING.rays
-    return View(detections.stamp, True, ids[found & sound], rays, strange)
+    ids, wanted = detections.ids.tolist(), robots.tolist()
+    finite = np.atleast_1d(np.isfinite(detections.corners).all(axis=(1, 2)))
+    found = [k for k, marker in enumerate(ids) if marker // SIDES in wanted]
+    sound = [k for k in found if finite[k] and ids.count(ids[k]) == 1]
+    rays = camera.undistort(detections.corners[sound]) if sound else NOTHING.rays
+    return View(detections.stamp, True, detections.ids[sound], rays, len(found) - len(sound))
 
 
 class FormationStep(LeafSystem):
@@ -197,9 +195,11 @@ class FormationStep(LeafSystem):
         """
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        counts: Counter[str] = Counter()
         task: StepTask = self._task_input.Eval(context)
-        number, status, tries = context.get_discrete_state(self._status).get_value()
+        number, status, tries = context.get_discrete_state(self._status).get_value().tolist()
+        if number == 0 and task is OFF:
+            return  # as most robots are, most of the time
+        counts: Counter[str] = Counter()
         memory = context.get_discrete_state(self._memory).get_value()
         if not task.sound:
             counts["bad_task"] += 1

@@ -119,6 +119,8 @@ class WheelDrive(LeafSystem):
         if context.get_time() < self._rest:
             command = np.zeros(2)
         sent = context.get_discrete_state(self._sent).get_value()
+        if not (sent.any() or command.any()):
+            return  # it stands: most robots of a formation do, most of the time
         wanted = self._within_reach(np.minimum(np.maximum(command, -self._limit), self._limit))
         changed = sent + np.minimum(np.maximum(wanted - sent, -self._change), self._change)
         # Once more: on its way from one to the other it may leave what the wheels can do.

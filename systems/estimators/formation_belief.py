@@ -28,9 +28,8 @@ from systems.estimators.formation_information import (
 from systems.estimators.formation_model import (
     SIDES,
     Layout,
+    SightingModel,
     Sightings,
-    jacobian,
-    residuals,
     variances,
 )
 from systems.estimators.formation_start import guess
@@ -265,12 +264,15 @@ class FormationEstimator:
         known = belief.robots[:, _KNOWN] == 1
         tested = known[seen.observer] & known[seen.target]
         inside = np.ones(len(tested), bool)
+        if not tested.any():
+            return inside
         seen = seen.select(tested)
         used = self._numbers
-        J = jacobian(self.layout, belief.x, seen)[:, :used]
+        model = SightingModel(self.layout, seen)
+        J = model.jacobian(belief.x)[:, :used]
         R = self._variances(seen.values, np.ones(len(J)))[:, :used]
         S = J @ belief.P @ J.transpose(0, 2, 1) + R[:, :, None] * np.eye(used)
-        r = residuals(self.layout, belief.x, seen)[:, :used, None]
+        r = model.residuals(belief.x)[:, :used, None]
         inside[tested] = (r * np.linalg.solve(S, r)).sum(axis=(1, 2)) <= self.parameters.gate
         return inside
 
@@ -300,7 +302,7 @@ class FormationEstimator:
         counts["accepted"] -= int((~kept).sum())
         self._forget(belief, seen.select(~kept))
         self._finish(belief, solution)
-        if placed:
+        if placed and not belief.moving[unknown].all():
             self._recognise(belief, seen.select(kept), strange[kept], unknown, solution)
 
     def _fit(
@@ -319,10 +321,16 @@ class FormationEstimator:
             worst = float((solution.residuals[matter] ** 2).max(initial=0.0))
             return _Fit(solution, worst, kept)
 
-        first = fit(guess(self.layout, belief.x, some.select(matter), unknown))
+        def anew() -> Array:
+            return guess(self.layout, belief.x, some.select(matter), unknown)
+
+        # On its way a robot is near where it was in the last picture; else that may be far off.
+        own = np.concatenate([3 * unknown, 3 * unknown + 1])
+        tracked = bool((belief.P[own, own] < _PLACED**2).all())
+        first = fit(belief.x if tracked else anew())
         if first.worst <= self.parameters.gate:
             return first
-        second = fit(belief.x)
+        second = fit(anew() if tracked else belief.x)
         return min(first, second, key=lambda trial: trial.worst)
 
     def _recognise(

@@ -19,13 +19,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.estimators.formation_model import Layout, Sightings, jacobian, residuals
+from systems.estimators.formation_model import Layout, SightingModel, Sightings
 
 Array = NDArray[np.float64]
 
 _ITERATIONS = 12
 _HALVINGS = 4
-_CONVERGED = 1e-7  # m and rad
+# m and rad; steps shrink by a factor of a thousand and more, so what is left is far below.
+_CONVERGED = 1e-5
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,15 +92,15 @@ def solve(layout: Layout, prior: Prior, sightings: Sightings, weights: Array, x:
         weights: (n, 2) reciprocal variances; 0 leaves a number out.
         x: (size,) where to begin.
     """
-    roots = np.sqrt(weights)
-    r, cost = _cost(layout, prior, sightings, roots, x)
+    model, roots = SightingModel(layout, sightings), np.sqrt(weights)
+    r, cost = _cost(prior, model, roots, x)
     for _ in range(_ITERATIONS):
-        J = _scaled_jacobian(layout, prior, sightings, roots, x)
+        J = _scaled_jacobian(prior, model, roots, x)
         H = prior.A + J.T @ J
         gradient = prior.b - prior.A @ (x - prior.origin) + J.T @ r.ravel()
         step = np.linalg.solve(H, gradient)
         for _ in range(_HALVINGS):
-            r_next, next_cost = _cost(layout, prior, sightings, roots, x + step)
+            r_next, next_cost = _cost(prior, model, roots, x + step)
             if next_cost <= cost:
                 break
             step /= 2
@@ -133,9 +134,9 @@ def leave(
         deviations: (3,) standard deviations of that.
     """
     prior = prior.about(x)
-    roots = np.sqrt(weights)
-    J = _scaled_jacobian(layout, prior, sightings, roots, x)
-    r = (residuals(layout, x, sightings) * roots).ravel()
+    model, roots = SightingModel(layout, sightings), np.sqrt(weights)
+    J = _scaled_jacobian(prior, model, roots, x)
+    r = (model.residuals(x) * roots).ravel()
     A = prior.A + J.T @ J
     b = prior.b + J.T @ (r + J @ (x - prior.origin))
 
@@ -157,17 +158,13 @@ def leave(
     return Prior(origin, (A + A.T) / 2, b, fixed)
 
 
-def _scaled_jacobian(
-    layout: Layout, prior: Prior, sightings: Sightings, roots: Array, x: Array
-) -> Array:
-    J = jacobian(layout, linearisation_point(prior, x), sightings) * roots[:, :, None]
-    return J.reshape(-1, layout.size)
+def _scaled_jacobian(prior: Prior, model: SightingModel, roots: Array, x: Array) -> Array:
+    J = model.jacobian(linearisation_point(prior, x)) * roots[:, :, None]
+    return J.reshape(2 * len(J), J.shape[2])
 
 
-def _cost(
-    layout: Layout, prior: Prior, sightings: Sightings, roots: Array, x: Array
-) -> tuple[Array, float]:
+def _cost(prior: Prior, model: SightingModel, roots: Array, x: Array) -> tuple[Array, float]:
     """Returns the residuals in standard deviations, and twice the cost."""
-    r = residuals(layout, x, sightings) * roots
+    r = model.residuals(x) * roots
     d = x - prior.origin
     return r, float(d @ prior.A @ d - 2 * prior.b @ d + (r * r).sum())

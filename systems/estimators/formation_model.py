@@ -144,53 +144,90 @@ def variances(
     return np.asarray(by_picture**2 / frames[:, None] + lasting**2)
 
 
+class SightingModel:
+    """What sightings would be in a state, and how they change with it.
+
+    Which numbers of the state matter for which sighting is looked up once: a least-squares search
+    asks again and again.
+
+    Args:
+        layout: of the state.
+        sightings: n of them.
+    """
+
+    def __init__(self, layout: Layout, sightings: Sightings) -> None:
+        n = np.arange(len(sightings.values))
+        observer, target = 3 * sightings.observer, 3 * sightings.target
+        yaw = layout.poses + sightings.observer * layout.cameras + sightings.camera
+        self._values = sightings.values
+        self._observer = observer, observer + 1, observer + 2
+        self._target = target, target + 1, target + 2
+        self._yaw = yaw
+        self._camera_yaw = layout.camera_yaws[sightings.camera]
+        self._side = sightings.marker % SIDES * (np.pi / 2)
+        self._offset = layout.marker_offset
+        # Where the derivatives are that are not zero: of the bearing, then of the distance.
+        x, y, heading = self._target
+        bearing = np.stack([x, y, heading, observer, observer + 1, observer + 2, yaw])
+        self._shape = (len(n), 2, layout.size)
+        row = 2 * layout.size * n
+        self._places = np.concatenate([row + bearing, row + layout.size + bearing[:5]]).ravel()
+
+    def predict(self, x: Array) -> Array:
+        """Returns what the sightings would be without noise in state x: (n, 2)."""
+        dx, dy, _, _ = self._lines(x)
+        yaw = x[self._observer[2]] + self._camera_yaw + x[self._yaw]
+        result = np.empty((len(dx), 2))
+        result[:, 0] = wrap(np.arctan2(dy, dx) - yaw)
+        result[:, 1] = np.log(np.hypot(dx, dy))
+        return result
+
+    def residuals(self, x: Array) -> Array:
+        """Returns by how much the sightings differ from those predicted: (n, 2), the first wrapped.
+
+        Args:
+            x: (size,) state.
+        """
+        difference: Array = self._values - self.predict(x)
+        difference[:, 0] = wrap(difference[:, 0])
+        return difference
+
+    def jacobian(self, x: Array) -> Array:
+        """Returns the derivatives of `predict` by the state, (n, 2, size), at x."""
+        dx, dy, lever_x, lever_y = self._lines(x)
+        squared = dx * dx + dy * dy
+        a, b = dx / squared, dy / squared  # of the logarithm of the distance; turned, of the angle
+        minus = np.full(len(dx), -1.0)
+        by_state = [
+            -b, a, b * lever_y + a * lever_x, b, -a, minus, minus,
+            a, b, b * lever_x - a * lever_y, -a, -b,
+        ]  # fmt: skip
+        result = np.zeros(self._shape)
+        result.ravel()[self._places] = np.concatenate(by_state)
+        return result
+
+    def _lines(self, x: Array) -> tuple[Array, Array, Array, Array]:
+        """Returns the lines from observers to markers, and from targets' axes to markers, in W."""
+        angle = x[self._target[2]] + self._side
+        lever_x, lever_y = self._offset * np.cos(angle), self._offset * np.sin(angle)
+        dx = x[self._target[0]] + lever_x - x[self._observer[0]]
+        dy = x[self._target[1]] + lever_y - x[self._observer[1]]
+        return dx, dy, lever_x, lever_y
+
+
 def predict(layout: Layout, x: Array, sightings: Sightings) -> Array:
     """Returns what the sightings would be without noise in state x: (n, 2)."""
-    line, _ = _lines(layout, x, sightings)
-    theta = x[3 * sightings.observer + 2]
-    yaw = layout.camera_yaws[sightings.camera] + x[_yaw_error(layout, sightings)]
-    bearing = wrap(np.arctan2(line[:, 1], line[:, 0]) - theta - yaw)
-    return np.column_stack([bearing, np.log(np.hypot(line[:, 0], line[:, 1]))])
+    return SightingModel(layout, sightings).predict(x)
 
 
 def residuals(layout: Layout, x: Array, sightings: Sightings) -> Array:
     """Returns by how much the sightings differ from those predicted: (n, 2), the first wrapped."""
-    difference = sightings.values - predict(layout, x, sightings)
-    difference[:, 0] = wrap(difference[:, 0])
-    return difference
+    return SightingModel(layout, sightings).residuals(x)
 
 
 def jacobian(layout: Layout, x: Array, sightings: Sightings) -> Array:
     """Returns the derivatives of `predict` by the state: (n, 2, size)."""
-    line, lever = _lines(layout, x, sightings)
-    squared = (line * line).sum(axis=1)[:, None]
-    # Of bearing and logarithm of the distance, by the line from observer to marker.
-    by_line = (
-        np.stack([line @ np.array([[0.0, 1.0], [-1.0, 0.0]]), line], axis=1) / squared[..., None]
-    )
-    n = np.arange(len(line))
-    result = np.zeros((len(line), 2, layout.size))
-    for axis in range(2):
-        result[n, :, 3 * sightings.target + axis] = by_line[:, :, axis]
-        result[n, :, 3 * sightings.observer + axis] = -by_line[:, :, axis]
-    turned = np.column_stack([-lever[:, 1], lever[:, 0]])
-    result[n, :, 3 * sightings.target + 2] = (by_line @ turned[:, :, None])[..., 0]
-    result[n, 0, 3 * sightings.observer + 2] = -1.0
-    result[n, 0, _yaw_error(layout, sightings)] = -1.0
-    return result
-
-
-def _lines(layout: Layout, x: Array, sightings: Sightings) -> tuple[Array, Array]:
-    """Returns the lines from observers to markers and from targets' axes to markers, in W."""
-    poses = x[: layout.poses].reshape(-1, 3)
-    target = poses[sightings.target]
-    angle = target[:, 2] + sightings.marker % SIDES * (np.pi / 2)
-    lever = layout.marker_offset * np.column_stack([np.cos(angle), np.sin(angle)])
-    return target[:, :2] + lever - poses[sightings.observer, :2], lever
-
-
-def _yaw_error(layout: Layout, sightings: Sightings) -> Index:
-    return layout.poses + sightings.observer * layout.cameras + sightings.camera
+    return SightingModel(layout, sightings).jacobian(x)
 
 
 def _cross(a: Array, b: Array) -> Array:

@@ -12,6 +12,7 @@ Leading dimensions are batches; a batch of none is one robot.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -105,7 +106,9 @@ def arcs(sent: Array, dt: float, now: float, start: float, end: float) -> Iterat
         start: not before now - n dt, s.
         end: s.
     """
-    for k in range(len(sent) - 1, -1, -1):
+    oldest = min(math.ceil((now - start) / dt) + 1, len(sent)) - 1
+    newest = max(math.floor((now - end) / dt) - 1, 0)
+    for k in range(oldest, newest - 1, -1):
         begin = now - (k + 1) * dt
         duration = min(begin + dt, end) - max(begin, start)
         if duration > 1e-9 and sent[k].any():
@@ -119,10 +122,12 @@ def predict(
     distance, angle = travel[..., 0], travel[..., 1]
     middle = x[..., 2] + angle / 2
     c, s = np.cos(middle), np.sin(middle)
-    F = np.broadcast_to(np.eye(SIZE), P.shape).copy()
-    F[..., 0, 2], F[..., 1, 2] = -distance * s, distance * c
     along = parameters.distance_noise**2 * np.abs(distance)
-    P = F @ P @ np.swapaxes(F, -1, -2)
+    # F P F' with F = 1 but for how the place follows the heading: row after row, then columns.
+    P = P.copy()
+    by_heading = np.stack([-distance * s, distance * c], axis=-1)
+    P[..., :2, :] += by_heading[..., None] * P[..., 2:3, :]
+    P[..., :, :2] += by_heading[..., None, :] * P[..., :, 2:3]
     P[..., 0, 0] += along * c * c
     P[..., 0, 1] += along * c * s
     P[..., 1, 0] += along * c * s

@@ -71,6 +71,36 @@ def test_commands_are_cut_at_the_times_of_pictures() -> None:
     assert np.array(travel) == pytest.approx(np.array(expected))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_no_command_is_left_out(seed: int) -> None:
+    """Against a sum over finely divided time."""
+    random = np.random.default_rng(seed)
+    sent, dt, now = random.normal(size=(21, 2)), 0.05, 7.35
+    start_time, end = np.sort(now - 21 * dt * random.random(2))
+    times = np.linspace(start_time, end, 200_001)
+    index = np.clip(np.floor((now - times) / dt).astype(int), 0, 20)
+    expected = np.trapezoid(sent[index], times, axis=0)
+    travel = np.sum(list(arcs(sent, dt, now, start_time, end)), axis=0)
+    assert travel == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_covariance_follows_the_motion_of_the_state() -> None:
+    """F P F' by numeric derivatives of the motion, for a batch of two robots."""
+    random = np.random.default_rng(1)
+    quiet = BearingFilterParameters(distance_noise=0.0, turn_noise=0.0, drift_noise=0.0)
+    A = random.normal(size=(2, 7, 7))
+    P, x = A @ A.transpose(0, 2, 1), random.normal(0, 0.5, (2, 7))
+    travel = np.array([[0.3, -0.2], [-0.1, 0.4]])
+    after = predict(x, P, travel, quiet)[1]
+    for k in range(2):
+        F = np.eye(7)
+        F[:3, :3] = [
+            approx_fprime(x[k, :3], lambda y, i=i, k=k: moved(y, travel[k])[i], 1e-7)
+            for i in range(3)
+        ]
+        assert after[k] == pytest.approx(F @ P[k] @ F.T, abs=1e-5)
+
+
 def test_prediction_grows_with_distance_and_not_in_its_steps() -> None:
     parameters = BearingFilterParameters(distance_noise=0.02, drift_noise=0.03, turn_noise=0.0)
     x, P = start(np.zeros(3), np.zeros((3, 3)), parameters)
