@@ -53,21 +53,22 @@ class Signal:
     rate: float
     played: bool = True
 
-    def channel(self, rate: float) -> Channel:
+    def channel(self, rate: float, repeat: float = 0.0) -> Channel:
         """Returns the recorder's channel.
 
         What is played back is looked at, at `rate` (Hz), the rate of the fastest consumer, which
         then sees each value at the time at which it saw it first. Messages are written when their
-        stamp is new.
+        stamp is new, vectors that do not change once in `repeat` (s; 0: always).
         """
-        only_new = not isinstance(self.model, int)
+        vector = isinstance(self.model, int)
         return Channel(
             port=self.port,
             topic=self.topic,
             encode=self.encode,
             model=self.model,
             rate=rate if self.played else self.rate,
-            only_new=only_new,
+            only_new=not vector,
+            repeat=repeat if vector else 0.0,
         )
 
     def player(self, reader: BagReader) -> tuple[MessagePlayback | VectorPlayback, float]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from abc import abstractmethod
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,10 @@ class Wiring:
         """Whether a block was added under that name."""
         return name in self._blocks
 
+    def block(self, name: str) -> System:
+        """Returns the block that was added under that name."""
+        return self._blocks[name]
+
     def value(self, name: str, context: Context) -> Any:
         """Returns what an output port says, once the diagram is built.
 
@@ -155,11 +160,18 @@ class Wiring:
         self._signals.append(signal)
         self._sources[signal.port] = source
 
-    def add_recorder(self, out: Path | None) -> Recorder | None:
+    def add_recorder(
+        self, out: Path | None, *, rate: float | None = None, repeat: float = 0.0
+    ) -> Recorder | None:
         """Adds the recorder of all signals, if the scenario wants a recording.
 
-        The recorder looks at every signal at the rate of the fastest: see `Signal.channel`. The
-        recording of an earlier run in the same folder is replaced.
+        The recording of an earlier run in the same folder is replaced.
+
+        Args:
+            out: folder of the run; None records nothing.
+            rate: at which the recorder looks at what is played back, Hz, see `Signal.channel`, and
+                at most at all else; by default that of the fastest signal.
+            repeat: vectors that do not change are recorded once in so long, s; 0: always.
 
         Raises:
             ValueError: the folder cannot be written, or holds the recording that is played.
@@ -177,10 +189,11 @@ class Wiring:
                 (out / "bag").rmdir()
             return None
         signals = [s for s in self._signals if wanted.images or not s.port.endswith(".image")]
-        rate = max(signal.rate for signal in signals)
+        looks = max(signal.rate for signal in signals) if rate is None else rate
+        signals = [replace(signal, rate=min(signal.rate, looks)) for signal in signals]
         recorder = self.add(
             Recorder(
-                channels=[signal.channel(rate) for signal in signals],
+                channels=[signal.channel(looks, repeat) for signal in signals],
                 writer=BagWriter(out / "bag"),
                 static=self.station.static_messages,
             ),

@@ -15,7 +15,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.io.bag import BagWriter
 from systems.io.ros_messages import Encoder, encoder
-from systems.validation import require, require_positive
+from systems.validation import require, require_non_negative, require_positive
 
 _log = logging.getLogger(__name__)
 
@@ -34,6 +34,8 @@ class Channel:
         rate: how often the port is looked at, Hz.
         only_new: record only what has another stamp than the last one recorded; for messages with
             a stamp.
+        repeat: a vector that is the same as the last one recorded is recorded again only after
+            this long, s; 0 records every look. Played back it is the same.
 
     Raises:
         ValueError: an attribute out of range, or a message type without a usual conversion.
@@ -45,6 +47,7 @@ class Channel:
     model: Any
     rate: float
     only_new: bool = False
+    repeat: float = 0.0
 
     def __post_init__(self) -> None:
         require(bool(self.port), "port", self.port, "a name")
@@ -54,6 +57,10 @@ class Channel:
             require(self.model > 0, "model", self.model, "a vector of at least one element")
         if self.only_new:
             require(hasattr(self.model, "stamp"), "model", self.model, "a message with a stamp")
+        require_non_negative(repeat=self.repeat)
+        require(
+            self.repeat == 0 or self.is_vector, "repeat", self.repeat, "0, of what is no vector"
+        )
         if isinstance(self.encode, str):
             encoder(self.encode)
 
@@ -122,6 +129,7 @@ class Recorder(LeafSystem):
         self._warned: set[str] = set()
         # What the file holds already is the file's state, not the diagram's.
         self._written_stamps: dict[str, float] = {}
+        self._written_vectors: dict[str, tuple[bytes, float]] = {}
         groups: dict[float, list[tuple[Channel, InputPort, Encoder]]] = {}
         for channel in channels:
             port = (
@@ -170,6 +178,12 @@ class Recorder(LeafSystem):
                 if stamp == self._written_stamps.get(channel.port):
                     continue
                 self._written_stamps[channel.port] = stamp
+            elif channel.repeat > 0:
+                last, since = self._written_vectors.get(channel.port, (b"", t))
+                now = value.tobytes()
+                if now == last and t < since + channel.repeat - 1e-9:
+                    continue
+                self._written_vectors[channel.port] = now, t
             # Of a pose Drake shows the one in its cache, which will change.
             self._waiting.append((channel.topic, encode, copy(value), t))
         chunk = self._writer.chunk(t)

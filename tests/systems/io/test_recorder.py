@@ -23,7 +23,7 @@ from systems.io.bag import BagReader, BagWriter
 from systems.io.recorder import Channel, Recorder
 from systems.io.ros_messages import encoder
 from systems.io.ros_motion import FrameTransform, imu_from_ros, pose_from_ros, transforms_to_ros
-from systems.io.ros_types import time_from_ros
+from systems.io.ros_types import message_class, time_from_ros
 from systems.io.ros_vision import camera_to_ros, detections_from_ros
 from systems.messages import Detections
 
@@ -341,3 +341,44 @@ def test_a_vector_source_of_drake_is_recorded(tmp_path):
     recorder.close()
     read = [(t, m.linear.x, m.angular.z) for _, t, m in BagReader(tmp_path / "bag").messages()]
     assert read == [(0.0, 0.3, -0.2), (0.1, 0.3, -0.2), (0.2, 0.3, -0.2)]
+
+
+class Steps(LeafSystem):
+    """A vector that changes at 1 s and at 2.5 s."""
+
+    def __init__(self):
+        super().__init__()
+        self.DeclareVectorOutputPort("sample", 1, self.calc)
+
+    def calc(self, context, output):
+        t = context.get_time()
+        output.SetFromVector([0.0 if t < 1 else 1.0 if t < 2.5 else 2.0])
+
+
+def test_a_vector_that_stays_the_same_is_repeated_now_and_then(tmp_path):
+    channel = Channel(
+        port="sample",
+        topic="/number",
+        encode=lambda value, _: message_class("std_msgs/msg/Float64")(float(value[0])),
+        model=1,
+        rate=10.0,
+        repeat=0.7,
+    )
+    builder = DiagramBuilder()
+    steps = builder.AddSystem(Steps())
+    recorder = builder.AddSystem(Recorder(channels=[channel], writer=BagWriter(tmp_path / "bag")))
+    builder.Connect(steps.GetOutputPort("sample"), recorder.GetInputPort("sample"))
+    simulator = Simulator(builder.Build())
+    simulator.AdvanceTo(3.0)
+    recorder.close()
+    written = [(t, m.data) for _, t, m in BagReader(tmp_path / "bag").messages(["/number"])]
+    times = [0.0, 0.7, 1.0, 1.7, 2.4, 2.5]
+    np.testing.assert_allclose([t for t, _ in written], times, atol=1e-9)
+    assert [value for _, value in written] == [0.0, 0.0, 1.0, 1.0, 1.0, 2.0]
+
+
+def test_only_vectors_are_repeated():
+    with pytest.raises(ValueError, match=r"repeat is 1\.0: must be 0, of what is no vector"):
+        Channel(port="d", topic="/d", encode=TAGS, model=Detections(), rate=1.0, repeat=1.0)
+    with pytest.raises(ValueError, match="repeat"):
+        Channel(port="d", topic="/d", encode=TAGS, model=3, rate=1.0, repeat=-1.0)
