@@ -9,6 +9,7 @@ from tests.benchmarks import (
     bench_flow,
     bench_formation_filter,
     bench_formation_models,
+    bench_formation_run,
     bench_lidar,
     bench_madgwick,
     bench_planner,
@@ -33,6 +34,7 @@ for title, module in (
     ("Building a triangle", bench_triangle),
     ("Estimator of a formation", bench_formation_filter),
     ("Models of a formation's errors", bench_formation_models),
+    ("Formation", bench_formation_run),
     ("Navigation robot", bench_run),
     ("SnailBot", bench_snailbot),
 ):
