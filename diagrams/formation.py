@@ -130,10 +130,8 @@ class FormationScenario(Scenario):
         check_faults(self)
         side = self.formation.side
         require_positive(side=side)
-        left_out = FormationStepParameters().side
-        same = self.step.side in (left_out, side)
-        require(same, "step.side", self.step.side, f"formation.side, {side:g}; best left out")
-        self.step = replace(self.step, side=side)
+        if self.step.side == FormationStepParameters().side:  # left out
+            self.step = replace(self.step, side=side)
         settling = self.controller.arguments.get("parameters")
         past = settling.beyond if isinstance(settling, SettlingParameters) else 0.0
         require(

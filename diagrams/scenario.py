@@ -297,6 +297,8 @@ def _note_lines(content: Any, key: Key, file: str, origins: dict[Key, str]) -> N
             # A key that YAML's merge key `<<` brought has no line of its own.
             if position := (content.lc.data or {}).get(name):  # type: ignore[attr-defined]
                 origins[(*key, str(name))] = f"{file}:{position[0] + 1}"
+                if isinstance(value, str):  # it may override a block's type
+                    origins[(*key, str(name), "type")] = f"{file}:{position[0] + 1}"
             _note_lines(value, (*key, str(name)), file, origins)
     elif isinstance(content, list):
         for index, value in enumerate(content):
@@ -308,6 +310,8 @@ def _note_lines(content: Any, key: Key, file: str, origins: dict[Key, str]) -> N
 def _note_override(value: Any, key: Key, text: str, origins: dict[Key, str]) -> None:
     """Notes an override as the origin of its key and of all that its value holds."""
     origins[key] = text
+    if isinstance(value, str):  # it may override a block's type
+        origins[(*key, "type")] = text
     inner = value if isinstance(value, Mapping) else {}
     if isinstance(value, list):
         inner = dict(enumerate(value))

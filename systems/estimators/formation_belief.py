@@ -42,9 +42,10 @@ REASONS = (
 )  # fmt: skip
 
 # Columns of `Belief.robots` and of `Belief.memory`.
-_STARTED, _STOPPED, _KNOWN, _FIXED = range(4)
+_STARTED, _STOPPED, _KNOWN, _FIXED, _TRACKED = range(5)
 _FRAMES, _LASTING, _VALUES = 0, 1, slice(2, 4)
 
+_EARLY = 1e-6  # of a period that times may be rounded by
 _OUTLIERS = 2  # that are looked for at once, when a robot is placed
 # How well a robot must be known from another that it sees, m, so that the model is straight enough
 # for a gate. From W it may be known far less.
@@ -79,8 +80,9 @@ class Belief:
         origin: (size,) of the prior, as are the next two (see `formation_information.Prior`).
         A: (size, size).
         b: (size,).
-        robots: (N, 4) when each last set out, s; since when it stands, s (inf while it moves);
-            whether it has been placed since; whether its derivatives are fixed.
+        robots: (N, 5) when each last set out, s; since when it stands, s (inf while it moves);
+            whether it has been placed since; whether its derivatives are fixed; when it was last
+            placed on its way, s.
         memory: (N, C, 4 N, 4) by observer, camera and marker: how many pictures; whether they
             are of two robots that stand; mean bearing and logarithm of the distance.
         stamps: (N, C) of the last picture, s.
@@ -142,7 +144,7 @@ class FormationEstimator:
         x = np.concatenate([self.start_poses.ravel(), np.zeros(n * cameras)])
         deviations = self.parameters.start_deviations(n, cameras)
         prior = start(self.layout, x, deviations)
-        robots = np.tile([-np.inf, -np.inf, 1.0, 0.0], (n, 1))
+        robots = np.tile([-np.inf, -np.inf, 1.0, 0.0, -np.inf], (n, 1))
         memory = np.zeros((n, cameras, SIDES * n, 4))
         stamps = np.full((n, cameras), -np.inf)
         nis = np.array([np.nan, 0.0])
@@ -210,6 +212,11 @@ class FormationEstimator:
         unknown = belief.robots[:, _KNOWN] == 0
         strange = unknown[seen.observer] | unknown[seen.target]
         if strange.any():
+            if belief.moving[unknown].all():
+                last = belief.robots[unknown, _TRACKED]
+                if t - last.min() < (1 - _EARLY) / self.parameters.track_rate:
+                    return counts  # nothing is built upon where a robot is on its way
+                belief.robots[unknown, _TRACKED] = t
             self._place(belief, seen, strange, counts)
         else:
             self._finish(belief, self._solve(belief, seen))

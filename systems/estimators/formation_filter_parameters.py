@@ -35,6 +35,7 @@ class FormationFilterParameters:
             99.9 % bound of chi-square with 2 degrees of freedom.
         settle_time: how long after a stop a sighting does not count for the new place yet, s.
         memory: how long a sighting of a moving robot is used, s.
+        track_rate: how often a robot on its way is placed, at most, Hz.
     """
 
     marker_size: float = 0.16
@@ -51,11 +52,13 @@ class FormationFilterParameters:
     gate: float = 13.8
     settle_time: float = 0.1
     memory: float = 0.3
+    track_rate: float = 10.0
 
     def __post_init__(self) -> None:
         above_zero = (
             "marker_size", "bearing_floor", "range_floor", "start_position_noise",
             "start_heading_noise", "move_position_noise", "move_heading_noise", "gate", "memory",
+            "track_rate",
         )  # fmt: skip
         require_positive(**{name: getattr(self, name) for name in above_zero})
         zero_allowed = ("marker_offset", "pixel_noise", "yaw_error", "settle_time")

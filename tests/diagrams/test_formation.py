@@ -114,7 +114,7 @@ def test_a_side_far_too_long_breaks_the_formation() -> None:
         ("start=[[0,0],[1,0],[2,0],[3,0]]", "start is [[0.0, 0.0], [1.0, 0.0]"),
         ("start=[[0,0],[1.5,0]]", "start is [[0.0, 0.0], [1.5, 0.0]]: must be places of all 4"),
         ("world.arena.boxes=[{position: [9.7, 0.6], size: [1, 1, 1]}]", "destination"),
-        ("step.side=2", "step.side is 2.0: must be formation.side, 1.5; best left out"),
+        ("step.side=2", "step.side is 2.0: must be 1.5, as formation.side is"),
         ("fail_robot=9", "fail_robot is 9: must be one of 1 to 4"),
         ("robot.body.ring=null", "robot.body.ring is None: must be markers for the others to see"),
         ("controller.side=3", "controller.side: unknown key"),

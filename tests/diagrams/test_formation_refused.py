@@ -10,7 +10,7 @@ import pytest
 Refuse = Callable[..., str]
 
 ON_A_LINE = "start=[[0,0],[1.5,0],[3,0],[4.5,0]]"
-IN_THE_WAY = "world.arena.boxes=[{position: [5.2, 0.6], size: [1, 1, 1]}]"
+IN_THE_WAY = "world.arena.boxes=[{position: [9.7, 0.6], size: [1, 1, 1]}]"
 
 
 def fault(**what: object) -> str:
@@ -28,7 +28,7 @@ def fault(**what: object) -> str:
         ),
         (
             IN_THE_WAY,
-            "formation.yaml:46: destination = [5.25, 0.65] lies in boxes[0]: the robot needs "
+            "formation.yaml:49: destination = [9.75, 0.65] lies in boxes[0]: the robot needs "
             "0.200 m of room",
         ),
         (
@@ -43,7 +43,7 @@ def fault(**what: object) -> str:
             "sqrt(3) sides of 3 m, and turned by up to 45 degrees its marker must be 12 px wide "
             "in front_camera (focal length 485 px), not 6.6",
         ),
-        ("formation.side=1.2", "step.side is 1.5: must be 1.2, as formation.side is"),
+        ("step.side=1.2", "step.side is 1.2: must be 1.5, as formation.side is"),
         (
             "estimator.marker_size=0.16",
             "estimator.marker_size is 0.16: must be 0.1, as robot.body.ring.size is",
@@ -64,7 +64,7 @@ def fault(**what: object) -> str:
         ),
         (
             "controller=algoritm1",
-            "--set controller: controller is 'algoritm1': no such controller; did you mean "
+            "--set controller: controller.type is 'algoritm1': no such controller; did you mean "
             "'algorithm1'? (or 'module:Class')",
         ),
         (

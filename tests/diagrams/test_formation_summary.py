@@ -32,8 +32,8 @@ def log(*, covariance: bool = True, done: bool = True) -> FormationLog:
     moved = t > 4 - 1e-9
     truth[moved, 1, :2] = target + OFF
     believed[t > 5 - 1e-9, 1] = target + OFF + WRONG
-    record = np.zeros((len(t), 8))
-    record[moved] = [1, 1, 2, 3, 0, *target, 1 if done else -1]
+    record = np.zeros((len(t), 10))
+    record[moved] = [1, 1, 2, 3, 0, *target, 1 if done else -1, 0, 0]
     estimate = np.zeros_like(truth)
     estimate[:, :, :2] = believed
     P = np.tile(1e-6 * np.eye(12), (len(t), 1, 1))

@@ -101,7 +101,7 @@ def test_who_stands_takes_no_room_in_the_recording(twin: Recorded) -> None:
     bag = BagReader(twin.folder / "bag")
     count = {k: len(list(bag.messages([f"/truth/robot{k}/pose"]))) for k in (1, 2)}
     assert seconds - 2 < count[1] < seconds + 2  # once a second
-    assert count[2] > 10 * seconds  # on its way, at the rate of the controllers
+    assert count[2] > 8 * seconds  # on its way, at the rate of the controllers, 10 Hz
 
 
 def test_played_back_the_estimates_and_the_moves_are_the_same(
