@@ -29,8 +29,8 @@ from diagrams.world import WorldParameters
 from plants.arena import check_free
 from systems.controllers.formation_step import FormationStepParameters
 from systems.formation.building import SettlingParameters
+from systems.planners.formation_ground import FormationParameters
 from systems.planners.formation_lattice import fit_lattice, strip
-from systems.planners.formation_moves import FormationParameters
 from systems.planners.formation_turns import FormationTurnsParameters
 from systems.planners.sonar_grid import SonarGridParameters
 from systems.validation import require, require_positive

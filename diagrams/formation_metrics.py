@@ -78,6 +78,12 @@ class FormationLog:
     estimate: Array | None
     covariance: Array | None
 
+    def known(self, robot: int) -> NDArray[np.bool_]:
+        """Returns at which times the estimator knows at all where a robot is, (m,)."""
+        assert self.covariance is not None
+        own = [3 * robot, 3 * robot + 1]
+        return np.asarray(self.covariance[:, own, own].sum(axis=1) < _LOST**2)
+
     def ends(self) -> NDArray[np.intp]:
         """Returns the samples at which moves had ended."""
         return np.flatnonzero(np.diff(self.record[:, 0], prepend=0.0) > 0)
@@ -175,3 +181,4 @@ def looked(log: FormationLog, end: np.intp) -> int:
 
 
 _LOOK = 1.0  # s
+_LOST = 1.0  # m; a robot on its way that nobody sees

@@ -67,7 +67,7 @@ class FormationMission(Mission):
         if meshcat is not None:
             self._show(meshcat)
         record_estimates(wiring, self._names)
-        controllers = [f"controller_{k}" for k in range(scenario.robots)]
+        controllers = [f"controller_{k + 1}" for k in range(scenario.robots)]
         deciding = [*controllers, "turns", *filter(wiring.has_block, ["estimator"])]
         rate = look_rate(wiring.block(name) for name in deciding)
         self.recorder = wiring.add_recorder(out, rate=rate, repeat=REPEAT)
@@ -78,7 +78,7 @@ class FormationMission(Mission):
         cameras = {name: scenario.robot.sensors[name].build().model() for name in CAMERAS}
         for k in range(scenario.robots):
             controller = scenario.controller.build(step=scenario.step, **cameras)
-            wiring.add(controller, f"controller_{k}")
+            wiring.add(controller, f"controller_{k + 1}")
         start = scenario.start_poses()
         wiring.add(FormationTurns(start_poses=start, parameters=scenario.turns), "turns")
         wiring.add(
@@ -106,15 +106,15 @@ class FormationMission(Mission):
         for k, name in enumerate(self._names):
             for camera in CAMERAS:
                 detections = f"{name}.{camera}.detections"
-                wiring.connect(detections, f"controller_{k}.{camera.split('_')[0]}_detections")
+                wiring.connect(detections, f"controller_{k + 1}.{camera.split('_')[0]}_detections")
                 if wiring.has_block("estimator"):
                     wiring.connect(detections, f"estimator.robot{k}_{camera}")
                 wiring.connect(detections, f"cameras.robot{k}_{camera}")
                 active = f"{name}.{camera}.active"
                 if wiring.has_input(active):
                     wiring.connect(f"cameras.robot{k}_{camera}_active", active)
-            wiring.connect(f"turns.task_{k}", f"controller_{k}.task")
-            wiring.connect(f"controller_{k}.status", f"turns.status_{k}")
+            wiring.connect(f"turns.task_{k}", f"controller_{k + 1}.task")
+            wiring.connect(f"controller_{k + 1}.status", f"turns.status_{k}")
             wiring.connect(self._command(k), f"{name}.drive.command")
         wiring.connect("turns.looking", "cameras.looking")
         if wiring.has_block("estimator"):
@@ -131,7 +131,7 @@ class FormationMission(Mission):
 
     def _command(self, robot: int) -> str:
         """Returns the output that commands a robot, with the faults that its motors have."""
-        command = f"controller_{robot}.command"
+        command = f"controller_{robot + 1}.command"
         faults = [f for f in faults_of(self._scenario, robot + 1) if f.signal == COMMAND]
         if not faults:
             return command
@@ -142,9 +142,9 @@ class FormationMission(Mission):
             )
         except ValueError as error:
             raise ScenarioError(f"faults of {name}.{COMMAND}: {error}") from error
-        self._wiring.add(injector, f"motors_{robot}")
-        self._wiring.connect(command, f"motors_{robot}.input")
-        return f"motors_{robot}.output"
+        self._wiring.add(injector, f"motors_{robot + 1}")
+        self._wiring.connect(command, f"motors_{robot + 1}.input")
+        return f"motors_{robot + 1}.output"
 
     def _log(self) -> None:
         kinds = ("pose", "contacts", "clearance")
@@ -229,7 +229,8 @@ class FormationMission(Mission):
             if log.truth is not None:
                 write_tum(out / f"truth_{name}.tum", log.t, log.truth[:, k])
             if log.estimate is not None:
-                write_tum(out / f"estimate_{name}.tum", log.t, log.estimate[:, k])
+                known = log.known(k)
+                write_tum(out / f"estimate_{name}.tum", log.t[known], log.estimate[known, k])
         moves = [move.to_plain() for move in log.moves()]
         if log.truth is not None:
             plot_formation(

@@ -20,7 +20,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem
 
 from diagrams.surroundings_viewer import along
 from diagrams.viewer import ellipse
-from systems.planners.formation_planner import FormationMove
+from systems.planners.formation_course import FormationMove
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from typing import Any
 from diagrams.random_world import RandomWorld
 from diagrams.schema import Place, convert, to_plain
 from plants.formation_arena import FormationArenaParameters, formation_arena
-from systems.planners.formation_moves import FormationParameters
+from systems.planners.formation_ground import FormationParameters
 
 
 def _draw(seed: int, data: Mapping[str, Any], place: Place) -> dict[str, Any]:

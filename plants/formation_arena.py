@@ -20,6 +20,7 @@ from plants.arena import ArenaParameters
 from plants.obstacles import BoxObstacle, CylinderObstacle, Wall
 from plants.planar_shapes import PlanarShapes
 from systems.noise import generator, stream_key
+from systems.planners.formation_ground import FormationParameters
 from systems.planners.formation_lattice import (
     Triangle,
     TriangleLattice,
@@ -27,7 +28,6 @@ from systems.planners.formation_lattice import (
     mirrored,
     sides_of,
 )
-from systems.planners.formation_moves import FormationParameters
 from systems.planners.formation_obstacles import Obstacles
 from systems.validation import require, require_non_negative, require_positive
 

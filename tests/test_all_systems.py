@@ -122,9 +122,10 @@ from systems.messages import (
 )
 from systems.planners.astar import AStarPlanner
 from systems.planners.failure import Failure
+from systems.planners.formation_course import FormationMove
 from systems.planners.formation_lattice import strip
 from systems.planners.formation_obstacles import Obstacles
-from systems.planners.formation_planner import FormationMove, FormationPlanner
+from systems.planners.formation_planner import FormationPlanner
 from systems.planners.formation_turns import FormationTurns
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor

@@ -26,6 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.planners.formation_ground import Ground, corner, middle
 from systems.planners.formation_lattice import (
     Triangle,
     Vertex,
@@ -37,11 +38,8 @@ from systems.planners.formation_moves import (
     NOTHING,
     Forbidden,
     Formation,
-    Ground,
     Move,
     candidates,
-    corner,
-    middle,
     move_to,
 )
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.controllers.step_task import StepTask
-from systems.planners.formation_planner import FormationMove
+from systems.planners.formation_course import FormationMove
 
 Array = NDArray[np.float64]
 

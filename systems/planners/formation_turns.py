@@ -24,7 +24,7 @@ from pydrake.systems.framework import (
 from systems.controllers.step_task import OFF, STATUS_SIZE, Status, StepTask
 from systems.formation.triangles import arrival_heading
 from systems.health import Counts
-from systems.planners.formation_planner import FormationMove
+from systems.planners.formation_course import FormationMove
 from systems.planners.formation_tasks import not_found, task_of, way_length
 from systems.validation import require, require_non_negative, require_positive
 

@@ -102,7 +102,7 @@ def test_a_beacon_that_is_taken_for_another_is_refused() -> None:
     faults = [{"robot": 0, "signal": s} | when | misread for s in signals]
     ended = run({"faults": faults})
     assert ended.report["outcome"] == "reached"
-    assert ended.report["health"]["controller_1"]["misread"] > 10
+    assert ended.report["health"]["controller_2"]["misread"] > 10
     assert ended.report["metrics"]["destination_error_m"] < 0.006
 
 

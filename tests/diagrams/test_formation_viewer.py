@@ -12,8 +12,8 @@ from pydrake.systems.analysis import Simulator
 
 from diagrams.formation_viewer import FormationViewer, dashes
 from systems.formation.triangles import next_vertex
+from systems.planners.formation_course import FormationMove
 from systems.planners.formation_lattice import strip
-from systems.planners.formation_planner import FormationMove
 from tests.diagrams.test_surroundings_viewer import Replay
 
 RATE = 20.0  # that of `Replay`

@@ -7,8 +7,8 @@ import pytest
 
 from plants.formation_arena import FormationArenaParameters, formation_arena, known_obstacles
 from plants.planar_shapes import PlanarShapes
+from systems.planners.formation_ground import FormationParameters
 from systems.planners.formation_lattice import fit_lattice
-from systems.planners.formation_moves import FormationParameters
 from systems.planners.formation_obstacles import clearance
 from tests.systems.planners.formations import fewest_moves
 

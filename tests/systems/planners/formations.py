@@ -11,15 +11,9 @@ from functools import cache
 import numpy as np
 
 from plants.planar_shapes import PlanarShapes
+from systems.planners.formation_ground import FormationParameters, Ground
 from systems.planners.formation_lattice import TriangleLattice, body_of, fit_lattice
-from systems.planners.formation_moves import (
-    Formation,
-    FormationParameters,
-    Ground,
-    Move,
-    formation_of,
-    in_reach,
-)
+from systems.planners.formation_moves import Formation, Move, formation_of, in_reach
 from systems.planners.formation_obstacles import Obstacles, clearance
 
 PARAMETERS = FormationParameters()

@@ -8,14 +8,9 @@ import pytest
 from plants.formation_arena import formation_arena, known_obstacles
 from plants.planar_shapes import PlanarShapes
 from systems.planners.formation_astar import astar_move, shortest_walk
+from systems.planners.formation_ground import FormationParameters, Ground
 from systems.planners.formation_lattice import fit_lattice, strip
-from systems.planners.formation_moves import (
-    Forbidden,
-    Formation,
-    FormationParameters,
-    Ground,
-    closest_vertex_move,
-)
+from systems.planners.formation_moves import Forbidden, Formation, closest_vertex_move
 from systems.planners.formation_obstacles import Obstacles
 from tests.systems.planners.formations import FREE, PARAMETERS, fewest_moves, travel
 

@@ -5,11 +5,10 @@ import math
 import numpy as np
 import pytest
 
+from systems.planners.formation_ground import FormationParameters, Ground
 from systems.planners.formation_lattice import Vertex, strip
 from systems.planners.formation_moves import (
     Formation,
-    FormationParameters,
-    Ground,
     candidates,
     closest_vertex_move,
     formation_of,

@@ -8,17 +8,11 @@ import pytest
 from pydrake.systems.analysis import Simulator
 
 from plants.formation_arena import formation_arena, known_obstacles
+from systems.planners.formation_course import FormationMove, Memory, Report, after
+from systems.planners.formation_ground import FormationParameters
 from systems.planners.formation_lattice import body_of, fit_lattice, strip
-from systems.planners.formation_moves import FormationParameters
 from systems.planners.formation_obstacles import Obstacles, clearance
-from systems.planners.formation_planner import (
-    RULES,
-    FormationMove,
-    FormationPlanner,
-    Memory,
-    Report,
-    after,
-)
+from systems.planners.formation_planner import RULES, FormationPlanner
 
 FREE = Obstacles(stamp=0.0)
 PARAMETERS = FormationParameters()

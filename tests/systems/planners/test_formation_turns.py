@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pydrake.systems.analysis import Simulator
 
 from systems.controllers.step_task import Status, StepTask
+from systems.planners.formation_course import FormationMove
 from systems.planners.formation_lattice import strip
-from systems.planners.formation_planner import FormationMove
 from systems.planners.formation_tasks import not_found
 from systems.planners.formation_turns import FormationTurns, FormationTurnsParameters
 

@@ -19,10 +19,11 @@ from plants.formation_arena import (
     known_obstacles,
 )
 from systems.messages import Scan
+from systems.planners.formation_course import FormationMove, Memory, Report, after
+from systems.planners.formation_ground import FormationParameters, past
 from systems.planners.formation_lattice import fit_lattice
-from systems.planners.formation_moves import FormationParameters, past
 from systems.planners.formation_obstacles import Obstacles, clearance
-from systems.planners.formation_planner import RULES, FormationMove, Memory, Report, after
+from systems.planners.formation_planner import RULES
 from systems.planners.sonar_grid import (
     SonarGridParameters,
     empty_sonar_grid,
