@@ -123,7 +123,7 @@ def formation_metrics(log: FormationLog, side: float) -> dict[str, Any]:
     nominal one. `broken`: whether one of those was outside 0.6 to 1.6 times that.
     `lateral_error_mm` and `longitudinal_error_mm`: means of the sizes, of each place against the
     vertex of its beacons where those truly stand; they take the estimator's corrections for errors.
-    `nees_mean`: of all poses together after each move, per dimension. `waits`: how often a robot
+    `nees_mean`: of all poses that are known together after each move, per dimension. `waits`: how often a robot
     on its way stood and waited; `retries`: tries of moves after the first; `replans`: moves that
     were given up, and others planned.
     """
@@ -164,8 +164,11 @@ def nees_mean(log: FormationLog) -> float | None:
         k = looked(log, k)
         error = log.estimate[k] - log.truth[k]
         error[:, 2] = wrap(error[:, 2])
-        e = error.ravel()
-        values.append(float(e @ np.linalg.solve(log.covariance[k], e)) / len(e))
+        # Of who is lost the covariance says no more than that.
+        known = np.repeat([log.known(robot)[k] for robot in range(len(error))], 3)
+        e = error.ravel()[known]
+        P = log.covariance[k][np.ix_(known, known)]
+        values.append(float(e @ np.linalg.solve(P, e)) / max(len(e), 1))
     return float(np.mean(values))
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from diagrams.formation_closed_loop import closed_loop
 from diagrams.formation_plots import (
     plot_cdfs,
     plot_over_time,
@@ -33,10 +34,12 @@ from diagrams.formation_table import (
     Numbers,
     by_robots,
     by_side,
+    cell,
     study_random,
     table1,
 )
 from diagrams.model_studies import Findings
+from diagrams.study_folder import Record
 from diagrams.study_report import TextTable
 from systems.formation.dead_reckoning import DeadReckoningParameters
 from systems.formation.error_models import FoldedNormalErrors, StepErrors
@@ -124,7 +127,12 @@ _STATISTICS = ("bias_m", "mean_m", "standard_deviation_m", "p95_m", "maximum_m")
 
 
 def formation_table1(
-    folder: Path, *, runs: int = 100, seed: int = 0, errors: StepErrors | None = None
+    folder: Path,
+    *,
+    runs: int = 100,
+    seed: int = 0,
+    errors: StepErrors | None = None,
+    plant_runs: int = 0,
 ) -> Numbers:
     """Writes table 1 of [FORM] and what belongs to it into a folder; returns all numbers.
 
@@ -136,6 +144,8 @@ def formation_table1(
         runs: of each model on each path.
         seed: of the study.
         errors: of a triangle of 1.5 m; by default the paper's distribution.
+        plant_runs: how many formations are simulated in the plant besides, closed loop, straight
+            ahead for as many moves as path 2 has; 0 for none.
 
     Raises:
         ValueError: too few runs.
@@ -153,6 +163,15 @@ def formation_table1(
         "robots": by_robots(runs=runs, seed=seed, errors=source),
         "sides": by_side(runs=runs, seed=seed, errors=source),
     }
+    if plant_runs > 0:
+        moves = numbers["table"]["triangles, sum"]["path 2"][0]["moves"]
+        numbers["plant_runs"] = plant_runs
+        numbers["closed_loop"] = {
+            way: closed_loop_cell(
+                closed_loop(folder / "runs" / name, way, moves=moves, runs=plant_runs)
+            )
+            for way, name in (("Algorithm I", "algorithm1"), ("ours", "ours"))
+        }
     _write(folder / "table1.json", numbers)
     table = _table1_table(numbers)
     notes = _table1_notes(numbers, "Bold")
@@ -170,6 +189,8 @@ def _table1_table(numbers: Numbers) -> TextTable:
     for name, paths in numbers["table"].items():
         cells = [_printed(cell) for path in PATHS for cell in _for_each_speed(paths[path])]
         rows.append([name, *cells])
+    for way, result in numbers.get("closed_loop", {}).items():
+        rows.append([f"closed loop, {way}", "-", "-", _printed(result), "the same"])
     for name, by_path in PAPER.items():
         row = [f"{value:.2f}" for path in PATHS for value in by_path[path]]
         rows.append([f"paper: {name}", *row])
@@ -179,6 +200,13 @@ def _table1_table(numbers: Numbers) -> TextTable:
 def _table1_notes(numbers: Numbers, mark: str) -> list[str]:
     """Returns what the table means; `mark` is what cells that begin with * are called."""
     moves = [numbers["table"]["triangles, sum"][path][0]["moves"] for path in PATHS]
+    closed = []
+    if "closed_loop" in numbers:
+        closed = [
+            f"closed loop: {numbers['plant_runs']} runs in the plant, straight ahead for "
+            f"{moves[1]} moves. Algorithm I: the paper's way, camera and latency such that its "
+            "triangles are as inexact as the paper's. ours: resection and estimator."
+        ]
     return [
         f"{numbers['runs']} runs; ± is the standard error of the mean. {mark}: within 15 % of the "
         "paper's (of triangles: of the mean of its two speeds).",
@@ -188,7 +216,16 @@ def _table1_notes(numbers: Numbers, mark: str) -> list[str]:
         "(a side outside 0.6-1.6 of the nominal), and which part broke.",
         f"Dead reckoning sampled every {numbers['period_s']:g} s. gyro bias: an integrated bias of "
         f"the heading's rate of {math.degrees(GYRO_BIAS):g} deg/s (standard deviation), ours.",
+        *closed,
     ]
+
+
+def closed_loop_cell(records: list[Record]) -> Numbers:
+    """Returns what came of closed loops: as of a chain, the mean over those that did not break."""
+    paper = float(np.mean(PAPER["triangles"]["path 2"]))
+    metrics = [record["metrics"] for record in records if record["outcome"] == "reached"]
+    whole = [m["destination_error_m"] for m in metrics if not m["broken"]]
+    return {**cell(np.array(whole), paper), "broken": 1 - len(whole) / len(records)}
 
 
 def _for_each_speed(cells: list[Numbers]) -> list[Numbers]:
@@ -215,6 +252,8 @@ def _write(path: Path, numbers: Numbers) -> None:
     path.write_text(json.dumps(numbers, indent=1, allow_nan=False) + "\n")
 
 
+_MODELLED_FOR_A_RUN = 25  # runs of models for each run in the plant, which takes a minute
+
 # --- By name, see `diagrams.model_studies` ---
 
 
@@ -225,5 +264,5 @@ def error_model_findings(folder: Path, runs: int) -> Findings:
 
 def table1_findings(folder: Path, runs: int) -> Findings:
     """Does `formation_table1` and returns what to print of it."""
-    numbers = formation_table1(folder, runs=runs)
+    numbers = formation_table1(folder, runs=runs, plant_runs=runs // _MODELLED_FOR_A_RUN)
     return Findings(_table1_table(numbers), _table1_notes(numbers, "*"))

@@ -78,27 +78,28 @@ def table1(
             cells = []
             for speed, paper in zip(WHEEL_SPEEDS, PAPER["dead reckoning"][path], strict=True):
                 times, sizes = _dead_reckoning(path, speed, model, runs, seed)
-                cells.append({"wheel_speed_rad_s": speed, **_cell(sizes[:, -1], paper)})
+                cells.append({"wheel_speed_rad_s": speed, **cell(sizes[:, -1], paper)})
                 curves[path][f"{name}, {speed} rad/s"] = _curve(times, sizes.mean(axis=0))
             numbers[name][path] = cells
     for path, corners in PATHS.items():
         walk = closest_vertex_walk(corners[1:])
         paper = float(np.mean(PAPER["triangles"][path]))
         sizes, chains = _triangles(walk, path, runs, seed, errors)
-        cell = {"moves": len(walk), **_cell(sizes[:, -1], paper)}
-        numbers.setdefault("triangles, sum", {})[path] = [cell]
+        numbers.setdefault("triangles, sum", {})[path] = [
+            {"moves": len(walk), **cell(sizes[:, -1], paper)}
+        ]
         series = {"triangles, sum": sizes.mean(axis=0)}
         for rule, (lasting, stood) in chains.items():
             name = f"triangles, chain ({rule})"
             whole = lasting[stood == len(walk), -1]
-            cell = {
+            chain_cell = {
                 "moves": len(walk),
-                **_cell(whole, paper),
+                **cell(whole, paper),
                 "broken": float((stood < len(walk)).mean()),
                 "half_broken_after_moves": _half_broken(stood, len(walk)),
                 "broken_within_40_moves": float((stood < 40).mean()) if len(walk) >= 40 else None,
             }
-            numbers.setdefault(name, {})[path] = [cell]
+            numbers.setdefault(name, {})[path] = [chain_cell]
             series[f"{name}, median"] = _median(lasting)
         for speed in WHEEL_SPEEDS:
             times = walk.times(speed=speed * WHEEL_RADIUS)
@@ -220,7 +221,8 @@ def study_random(seed: int, name: str, block: int = 0) -> np.random.Generator:
     return generator(stream_key(seed, f"formation/{name}"), block)
 
 
-def _cell(sizes: Array, paper: float) -> Numbers:
+def cell(sizes: Array, paper: float) -> Numbers:
+    """Returns mean, standard error, and how the mean compares to the paper's number (m)."""
     numbers = _mean(sizes)
     mean = numbers["mean_m"]
     ratio = None if mean is None else mean / paper

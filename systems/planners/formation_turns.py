@@ -122,8 +122,9 @@ class FormationTurns(LeafSystem):
         progress (output, vector of 2): number of the move, and 1 when it is done, -1 when it was
             given up (its controller took too long, the robot has failed, or the planner wants
             something else), else 0.
-        positions (output, vector of 2 N): x, y of the robots as they are believed to be; NaN for
-            one that is looked for and not found.
+        positions (output, vector of 2 N): x, y of the robots as they are believed to be, where it
+            was known last for one that is not known now; NaN for one that is looked for and not
+            found.
         believed (output, vector of 3 N): [x, y, theta] of the robots, likewise, but never NaN.
         record (output, vector of 10): number of the last move that ended, its robot, its three
             beacons, its target (2, m), what became of it (1 or -1), how often the robot stood and
@@ -360,8 +361,10 @@ class FormationTurns(LeafSystem):
         if not np.isfinite(told).all():
             counts["bad_pose"] += 1
             return poses
+        # What is told of a robot that nothing places may be anywhere: its last place counts.
+        told = np.where(self._not_found(context)[:, None], poses, told)
         discrete_state.set_value(self._belief, told.ravel())
-        return np.asarray(told)
+        return told
 
     def _outcome(
         self,

@@ -7,7 +7,6 @@ on where it was interrupted.
 from __future__ import annotations
 
 import argparse
-import math
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from diagrams.formation_closed_loop import PAPERS_WAY
 from diagrams.study import load_study, run_study
 from tests.benchmarks.table import Row, show
 
@@ -27,21 +27,6 @@ BASE = (
     "world.arena.ground=80.0",
     "duration=6000.0",
 )
-
-# [FORM]'s way and conditions that give its errors of a triangle (see systems.formation.trials): a
-# camera that looks 3 px aside is a principal point that is 3 px off.
-_ASIDE = math.degrees(math.atan(3 / 485))
-PAPERS_ERRORS = tuple(
-    f"robot.sensors.{camera}.{key}"
-    for camera, yaw in (("front_camera", _ASIDE), ("rear_camera", 180 + _ASIDE))
-    for key in (
-        "latency=0.2",
-        "rate=20.0",
-        "projector.pixel_noise=0.5",
-        f"rpy_deg=[0.0, 0.0, {yaw:.4f}]",
-    )
-)
-PAPERS_WAY = ("controller=algorithm1", "estimator=none", "planner=closest")
 
 
 @dataclass(frozen=True)
@@ -77,7 +62,7 @@ TOLD = Kind(
 )
 PAPER = Kind(
     "the paper's way with its errors, twin",
-    (*BASE, "dynamics=kinematic", "duration=3000.0", *PAPERS_WAY, *PAPERS_ERRORS),
+    (*BASE, "dynamics=kinematic", "duration=3000.0", *PAPERS_WAY),
     False,
 )
 

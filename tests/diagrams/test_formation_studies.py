@@ -13,10 +13,13 @@ from numpy.typing import NDArray
 
 import diagrams.formation_table as formation_table
 from diagrams.cli import console
+from diagrams.formation_closed_loop import PAPERS_ERRORS, WAYS, straight_ahead
 from diagrams.formation_plots import folded_normal_cdf
-from diagrams.formation_studies import formation_error_model, formation_table1
+from diagrams.formation_studies import closed_loop_cell, formation_error_model, formation_table1
 from diagrams.formation_table import PAPER, PATHS, by_robots, by_side, table1
 from diagrams.model_studies import STUDIES, ModelStudy
+from diagrams.run import simulate
+from diagrams.scenario import load_scenario
 from systems.formation.error_models import FoldedNormalErrors, MeasuredErrors
 from systems.formation.trials import Algorithm1Trials
 
@@ -366,3 +369,29 @@ def test_the_list_names_the_studies(tagtrail: Command) -> None:
     for name, study in STUDIES.items():
         assert [line.split()[0] for line in lines].count(name) == 1
         assert any(line.startswith(name) and study.description in line for line in lines)
+
+
+def test_closed_loops_that_broke_are_in_no_mean() -> None:
+    records = [
+        {"outcome": "reached", "metrics": {"destination_error_m": 0.1, "broken": False}},
+        {"outcome": "reached", "metrics": {"destination_error_m": 0.2, "broken": False}},
+        {"outcome": "reached", "metrics": {"destination_error_m": 9.0, "broken": True}},
+        {"outcome": "timeout", "metrics": {"destination_error_m": 9.0, "broken": False}},
+    ]
+    found = closed_loop_cell(records)
+    assert found["mean_m"] == pytest.approx(0.15)
+    assert found["broken"] == 0.5
+    assert found["paper_m"] == pytest.approx(0.135)  # of both speeds
+    assert found["fits"]
+
+
+def test_a_formation_goes_straight_ahead_for_as_many_moves_as_asked(tmp_path: Path) -> None:
+    moves = 2
+    for way in WAYS:
+        scenario = load_scenario(
+            "formation", [*straight_ahead(moves), *WAYS[way], "dynamics=kinematic"]
+        )
+        run = simulate(scenario, out=tmp_path / way)
+        assert run.report["outcome"] == "reached"
+        assert run.report["metrics"]["moves"] == moves
+    assert set(PAPERS_ERRORS) < set(WAYS["Algorithm I"])

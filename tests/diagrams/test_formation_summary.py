@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 
-from diagrams.formation_metrics import FormationLog, formation_metrics
+from diagrams.formation_metrics import FormationLog, formation_metrics, nees_mean
 from diagrams.formation_summary import formation_figure, plot_formation
 from plants.arena import ArenaParameters
 from systems.formation.triangles import next_vertex
@@ -102,3 +102,19 @@ def test_a_move_that_was_given_up_is_in_no_panel(tmp_path: Path) -> None:
         target, log(done=False), arena=ArenaParameters(), destination=[5.0, 0.6], side=1.5
     )
     assert cv2.imread(str(target)).std() > 5
+
+
+def test_a_robot_that_is_lost_is_left_out_of_consistency_and_trajectory() -> None:
+    sound = log()
+    assert sound.covariance is not None
+    assert sound.known(1).all()
+    expected = nees_mean(sound)
+    lost = sound.covariance.copy()
+    lost[:, 0, 0] = 30.0**2
+    estimate = np.array(sound.estimate)
+    estimate[:, 0, 1] += 3.0  # along what counts as known: one sighting leaves a circle
+    astray = replace(sound, covariance=lost, estimate=estimate)
+    assert not astray.known(0).any()
+    assert astray.known(1).all()
+    # Robot 1 has no error in either: of 12 numbers 9 are left.
+    assert nees_mean(astray) == pytest.approx(expected * 12 / 9)

@@ -285,3 +285,23 @@ def test_a_move_that_was_made_already_is_not_made_again() -> None:
 def test_a_start_that_is_none_is_refused(poses: Array, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         FormationTurns(start_poses=poses)
+
+
+def test_of_a_robot_that_nothing_places_the_last_place_counts() -> None:
+    rig = driving(Rig(estimate=True))
+    known = np.tile(1e-4, 12)
+    told = START.copy()
+    told[1] = [1.0, 1.0, 0.5]
+    rig.block.poses_input_port().FixValue(rig.context, told.ravel())
+    rig.block.covariance_input_port().FixValue(rig.context, np.diag(known).ravel())
+    rig.wait(0.2)
+    np.testing.assert_allclose(rig.output("believed").reshape(4, 3), told)
+    astray = told.copy()
+    astray[1] = [-7.0, 4.0, 2.0]  # anywhere on a circle about a robot that it sees
+    lost = known.copy()
+    lost[3:6] = 25.0
+    rig.block.poses_input_port().FixValue(rig.context, astray.ravel())
+    rig.block.covariance_input_port().FixValue(rig.context, np.diag(lost).ravel())
+    rig.wait(0.2)
+    np.testing.assert_allclose(rig.output("believed").reshape(4, 3), told)
+    np.testing.assert_allclose(rig.output("positions").reshape(4, 2), told[:, :2])
