@@ -123,9 +123,9 @@ def formation_metrics(log: FormationLog, side: float) -> dict[str, Any]:
     nominal one. `broken`: whether one of those was outside 0.6 to 1.6 times that.
     `lateral_error_mm` and `longitudinal_error_mm`: means of the sizes, of each place against the
     vertex of its beacons where those truly stand; they take the estimator's corrections for errors.
-    `nees_mean`: of all poses that are known together after each move, per dimension. `waits`: how often a robot
-    on its way stood and waited; `retries`: tries of moves after the first; `replans`: moves that
-    were given up, and others planned.
+    `nees_mean`: of all poses that are known together after each move, per dimension. `waits`: how
+    often a robot on its way stood and waited; `retries`: tries of moves after the first; `replans`:
+    moves that were given up, and others planned.
     """
     moves = [move for move in log.moves() if move.done]
     ended = log.record[log.ends()]

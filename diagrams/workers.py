@@ -10,6 +10,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -146,7 +147,8 @@ class _Worker:
 
 
 def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
-    """Works until the other end is closed, by whoever started this process or by its death."""
+    """Works until the other end is closed; ends at once when whoever started this process dies."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
     result = None  # the first message only says that the process is up
     while True:
         try:
@@ -155,6 +157,13 @@ def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
         except (EOFError, OSError):
             return
         result = function(task)
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)  # nobody wants the task in hand any more
 
 
 @contextmanager

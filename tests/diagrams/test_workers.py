@@ -92,5 +92,31 @@ def test_a_script_without_its_guard_is_told(tmp_path: Path) -> None:
     assert "under `if __name__ == '__main__':`" in finished.stderr.splitlines()[-1]
 
 
+def test_no_process_outlives_a_killed_caller(tmp_path: Path) -> None:
+    """Nothing that the caller would do at its end is done when it is killed."""
+    script = tmp_path / "script.py"
+    busy = "(print(__import__('os').getpid(), flush=True), __import__('time').sleep(60))"
+    script.write_text(
+        "from diagrams.workers import work\n"
+        "if __name__ == '__main__':\n"
+        f"    list(work(eval, [{busy!r}], workers=1, tasks_per_worker=1))\n"
+    )
+    caller = subprocess.Popen(
+        [sys.executable, str(script)],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert caller.stdout is not None
+    worker = int(caller.stdout.readline())
+    os.kill(worker, 0)  # it is there
+    caller.kill()
+    # Its output is at an end once nobody holds it open.
+    assert caller.stdout.read() == ""
+    caller.stdout.close()
+    caller.wait()
+
+
 def test_there_is_at_least_one_core() -> None:
     assert 1 <= available_cores() <= (os.cpu_count() or 1)
