@@ -21,6 +21,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem
 from diagrams.surroundings_viewer import along
 from diagrams.viewer import ellipse
 from systems.planners.formation_course import FormationMove
+from systems.planners.formation_turns import RECORD_SIZE
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -131,7 +132,7 @@ class FormationViewer(LeafSystem):
     Ports:
         move (input, FormationMove): what the formation is at.
         moving (input, vector of N): other than 0 for the robot that moves.
-        record (input, vector of 8): of the last move that ended, see `FormationTurns`.
+        record (input, vector of 10): of the last move that ended, see `FormationTurns`.
         positions (input, vector of 2 N): x, y of the robots as they are believed to be, m in map.
         poses (input, vector of 3 N): [x (m), y (m), theta (rad)] of the estimator; unconnected,
             pins without needles and ellipses stand at `positions`.
@@ -159,7 +160,7 @@ class FormationViewer(LeafSystem):
             "move", AbstractValue.Make(FormationMove())
         )
         self._moving_input = self.DeclareVectorInputPort("moving", robots)
-        self._record_input = self.DeclareVectorInputPort("record", 8)
+        self._record_input = self.DeclareVectorInputPort("record", RECORD_SIZE)
         self._positions_input = self.DeclareVectorInputPort("positions", 2 * robots)
         self._poses_input = self.DeclareVectorInputPort("poses", 3 * robots)
         self._covariance_input = self.DeclareVectorInputPort("covariance", 9 * robots**2)
@@ -342,14 +343,14 @@ class FormationViewer(LeafSystem):
 
     def _show_built(self, record: Array, positions: Array, t: float) -> None:
         """Draws the sides that a move has built, for good."""
-        number, _, one, two, _, *target, outcome = record
+        number, _, one, two, _, x, y, outcome, *_ = record
         if number <= self._ended:
             return
         self._ended = int(number)
         if outcome > 0:
             name = f"{_ROOT}/built/{self._ended}"
             for k, beacon in enumerate((int(one), int(two))):
-                ends = positions[beacon], np.array(target)
+                ends = positions[beacon], np.array([x, y])
                 self._line(f"{name}/{k}", *ends, 0.012, _WHITE, height=0.003)
             self._appear(name, t)
 

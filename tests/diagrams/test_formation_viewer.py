@@ -78,7 +78,7 @@ class Show:
         self.context = self.simulator.get_mutable_context()
         self.fix("move", AbstractValue.Make(FormationMove()))
         self.fix("moving", np.zeros(4))
-        self.fix("record", np.zeros(8))
+        self.fix("record", np.zeros(10))
         self.fix("positions", STAND.ravel())
         if estimated:
             self.fix("poses", np.column_stack([STAND, np.zeros(4)]).ravel())
@@ -103,7 +103,7 @@ class Show:
             self.fix("truth_1", np.array([*place, 0.1]))
             self.to(t + 0.03)
         self.fix("moving", np.zeros(4))
-        self.fix("record", np.array([1, 1, *BEACONS, *TARGET, 1.0]))
+        self.fix("record", np.array([1, 1, *BEACONS, *TARGET, 1.0, 0.0, 0.0]))
         self.to(3.0 - 0.02)
         self.fix("move", AbstractValue.Make(FormationMove(status="reached", number=1)))
         self.to(4.0)
@@ -160,7 +160,7 @@ def test_sides_that_were_built_stay(stage: Stage) -> None:
 
 def test_a_side_that_was_not_built_is_not_drawn() -> None:
     show = Show()
-    show.fix("record", np.array([1, 1, *BEACONS, *TARGET, -1.0]))
+    show.fix("record", np.array([1, 1, *BEACONS, *TARGET, -1.0, 0.0, 0.0]))
     show.to(1.0)
     assert not show.stage.named("view/built")
 
