@@ -21,7 +21,6 @@ from diagrams.formation_sensing import (
     sensed_obstacles,
     touched,
 )
-from diagrams.formation_summary import plot_formation
 from diagrams.formation_viewer import FormationViewer
 from diagrams.mission import Mission, Wiring
 from diagrams.schema import ScenarioError
@@ -224,6 +223,8 @@ class FormationMission(Mission):
 
     def write(self, context: Context, out: Path) -> None:
         """Writes `summary.png`, trajectories and the moves."""
+        from diagrams.formation_summary import plot_formation  # loads Matplotlib
+
         log = self.formation_log(context)
         for k, name in enumerate(self._names):
             if log.truth is not None:

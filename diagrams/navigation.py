@@ -26,7 +26,6 @@ from diagrams.metrics import (
     pose_metrics,
 )
 from diagrams.mission import FRAME_RATE, Mission, Wiring
-from diagrams.plots import plot_navigation
 from diagrams.scenario import Scenario
 from diagrams.station import RobotParameters
 from diagrams.tables import Choice, Table
@@ -284,6 +283,8 @@ class NavigationMission(Mission):
 
     def write(self, context: Context, out: Path) -> None:
         """Writes `summary.png`, `truth.tum` and `estimate.tum`."""
+        from diagrams.plots import plot_navigation  # loads Matplotlib
+
         log = self.pose_log(context)
         write_tum(out / "estimate.tum", log.t[log.known], log.estimate[log.known])
         if log.truth is not None:

@@ -465,7 +465,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
         {
             "move": (FormationMove(), FormationMove(stamp=0.0, status="reached", number=1)),
             "moving": vector(0.0, 1.0, 0.0, 0.0),
-            "record": vector(*np.zeros(8)),
+            "record": vector(*np.zeros(10)),
             "positions": vector(*range(8)),
             "poses": vector(*range(12)),
             "covariance": vector(*(1e-4 * np.eye(12).ravel())),

@@ -190,7 +190,7 @@ def test_where_the_bundled_file_says_it_its_line_is_told(refuse: Refuse) -> None
          "faults: there is no signal robot.camera.detectoins; did you mean "
          "'robot.camera.detections'?"),
         ("robot.faults=[{signal: imu.sample, kind: silent}]",
-         "faults of robot.imu.sample: kind is 'silent': must be frozen or nan or garbled"),
+         "faults of robot.imu.sample: kind is 'silent': must be frozen or nan or garbled or dead"),
         ("estimator=systems.estimators.planar_ekf:PlanarEkf",
          "estimator.pose does not fit route.pose: "),
     ],

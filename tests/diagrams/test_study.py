@@ -353,7 +353,7 @@ class Fussy(LeafSystem):
 
     def look(self, context):
         y = self.pose.Eval(context)[1]  # noisy in its last digits, so another one for every seed
-        if int(abs(y) * 1e9) % 4 == 0:
+        if int(abs(y) * 1e9) % 3 == 0:
             raise FloatingPointError(f"y is {y}")
 """
 
