@@ -161,9 +161,10 @@ def planar_poses(rays: Array, by_ray: Array, sizes: Array) -> PlanarPoses:
     R, p, error, information = _better_first(minima)
     merged = angle_between(R[:, 0], R[:, 1]) < SAME_POSE
     if merged.any():
-        mirrored = _mirrored(R[merged, 0], p[merged, 0])
+        p_first = p[merged, 0]
+        mirror = mirrored(R[merged, 0], -p_first / np.linalg.norm(p_first, axis=1, keepdims=True))
         seen = points[merged], rays[merged], by_ray[merged]
-        image = refine(mirrored, _translations(mirrored, *seen[:2]), *seen, iterations=0)
+        image = refine(mirror, _translations(mirror, *seen[:2]), *seen, iterations=0)
         R[merged, 1], p[merged, 1] = image.R, image.p
         error[merged, 1], information[merged, 1] = image.squared_error, image.information
     poses.R[good], poses.p[good] = R, p
@@ -202,12 +203,15 @@ def _points(sizes: Array) -> Array:
     return marker_corners(1.0) * sizes[:, None, None]
 
 
-def _mirrored(R: Array, p: Array) -> Array:
-    """Returns `R_CM` with the marker's normal (x) mirrored about the line of sight.
+def mirrored(R: Array, sight: Array) -> Array:
+    """Returns markers' rotations with the normal (x) mirrored about the line of sight.
 
     A rotation by twice the tilt, about the axis at right angles to both.
+
+    Args:
+        R: (n, 3, 3) of markers in any frame.
+        sight: (n, 3) directions to the viewer in that frame, of length 1.
     """
-    sight = -p / np.linalg.norm(p, axis=1, keepdims=True)
     normal = R[:, :, 0]
     axis = np.cross(normal, sight)
     sine = np.linalg.norm(axis, axis=1, keepdims=True)

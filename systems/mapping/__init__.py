@@ -1,0 +1,1 @@
+"""Maps of tags from recordings: start, adjustment, checks."""

@@ -1,0 +1,149 @@
+"""Where cameras and tags are, and how far that is from what pictures and odometry say.
+
+Tangents: rotation first, a small rotation vector in the parent (C for cameras, W for tags), then
+the position in the parent.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.mapping.sightings import Sightings
+from systems.markers.layout import marker_corners
+from systems.markers.pnp import cross_matrix, rotation_from_vector
+
+Array = NDArray[np.float64]
+
+_CORNERS = marker_corners(1.0)
+_MIN_DEPTH = 1e-3  # m before the camera
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Where cameras and tags are.
+
+    Attributes:
+        R_CW: (frames, 3, 3).
+        p_CW: (frames, 3) m.
+        R_WT: (tags, 3, 3).
+        p_WT: (tags, 3) m.
+    """
+
+    R_CW: Array
+    p_CW: Array
+    R_WT: Array
+    p_WT: Array
+
+    def positions(self) -> Array:
+        """Returns `p_WC` of the cameras, (frames, 3) m."""
+        return -(self.R_CW.swapaxes(1, 2) @ self.p_CW[..., None])[..., 0]
+
+    def moved(self, cameras: Array, tags: Array) -> Scene:
+        """Returns it after steps (frames, 6) and (tags, 6)."""
+        return Scene(
+            rotation_from_vector(cameras[:, :3]) @ self.R_CW,
+            self.p_CW + cameras[:, 3:],
+            rotation_from_vector(tags[:, :3]) @ self.R_WT,
+            self.p_WT + tags[:, 3:],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """What odometry says of the way from each frame to the next: (frames - 1) of each.
+
+    Attributes:
+        R: (n, 3, 3) `R_CC'`, of the next camera C' in this one C.
+        p: (n, 3) `p_CC'`, m.
+        root: (n, 6, 6) square root of the information: root @ error has unit covariance; zeros
+            where nothing is known. The error is [rotation vector, position] in C.
+    """
+
+    R: Array
+    p: Array
+    root: Array
+
+    def over(self, frames: NDArray[np.intp]) -> Motion:
+        """Returns it between the chosen frames (ascending) only, one motion after the other."""
+        R, p, root = [], [], []
+        for first, last in itertools.pairwise(frames.tolist()):
+            R_k, p_k, C = np.eye(3), np.zeros(3), np.zeros((6, 6))
+            for k in range(first, last):
+                turned = np.zeros((6, 6))
+                turned[:3, :3] = turned[3:, 3:] = R_k
+                arm = cross_matrix(R_k @ self.p[k])
+                information = self.root[k].T @ self.root[k]
+                # Earlier errors of rotation swing what comes later.
+                carry = np.eye(6)
+                carry[3:, :3] = -arm
+                C = carry @ C @ carry.T + turned @ np.linalg.pinv(information) @ turned.T
+                R_k, p_k = R_k @ self.R[k], p_k + R_k @ self.p[k]
+            R.append(R_k)
+            p.append(p_k)
+            root.append(np.linalg.cholesky(np.linalg.inv(C)).T)
+        return Motion(np.array(R), np.array(p), np.array(root))
+
+
+def residuals(scene: Scene, sightings: Sightings) -> tuple[Array, Array, Array]:
+    """Returns the residuals of corners and their derivatives.
+
+    Returns:
+        (m, 8) px, and (m, 8, 6) by the camera's step and by the tag's. Of a corner that is not
+        before the camera the residuals are infinite.
+    """
+    s = sightings
+    R_CW, p_CW = scene.R_CW[s.frame], scene.p_CW[s.frame]
+    arm_W = (_CORNERS * s.sizes[s.tag][:, None, None]) @ scene.R_WT[s.tag].swapaxes(1, 2)
+    arm_C = (arm_W + scene.p_WT[s.tag][:, None]) @ R_CW.swapaxes(1, 2)  # from W's origin, told in C
+    p_C = arm_C + p_CW[:, None]
+    behind = (p_C[..., 2] < _MIN_DEPTH).any(axis=1)
+    p_C[behind] = (0.0, 0.0, 1.0)
+    ray = p_C[..., :2] / p_C[..., 2:]
+    by_position = np.empty((len(s), 4, 2, 3))
+    by_position[..., :2] = s.by_ray
+    by_position[..., 2:] = -(s.by_ray @ ray[..., None])
+    by_position /= p_C[..., 2][..., None, None]
+    by_camera = np.empty((len(s), 4, 2, 6))
+    by_camera[..., :3] = by_position @ cross_matrix(-arm_C)
+    by_camera[..., 3:] = by_position
+    by_tag = np.empty((len(s), 4, 2, 6))
+    by_tag[..., 3:] = by_position @ R_CW[:, None]
+    by_tag[..., :3] = by_tag[..., 3:] @ cross_matrix(-arm_W)
+    r = (s.by_ray @ (ray - s.rays)[..., None])[..., 0].reshape(-1, 8)
+    r[behind] = np.inf
+    return r, by_camera.reshape(-1, 8, 6), by_tag.reshape(-1, 8, 6)
+
+
+def motion_residuals(scene: Scene, motion: Motion) -> tuple[Array, Array, Array]:
+    """Returns the residuals of motions and their derivatives.
+
+    Returns:
+        (n, 6), and (n, 6, 6) by the steps of a camera and of the next one.
+    """
+    R, p = scene.R_CW, scene.p_CW
+    R_rel = R[:-1] @ R[1:].swapaxes(1, 2)
+    p_next = (R_rel @ p[1:, :, None])[..., 0]
+    turn = rotation_vector(R_rel @ motion.R.swapaxes(1, 2))
+    error = np.concatenate([turn, p[:-1] - p_next - motion.p], axis=1)
+    n = len(R) - 1
+    here, there = np.zeros((n, 6, 6)), np.zeros((n, 6, 6))
+    # The rotation vector's own derivative is 1 to first order in the error, which is small.
+    here[:, :3, :3] = here[:, 3:, 3:] = np.eye(3)
+    here[:, 3:, :3] = cross_matrix(p_next)
+    there[:, :3, :3] = there[:, 3:, 3:] = -R_rel
+    there[:, 3:, :3] = -R_rel @ cross_matrix(p[1:])
+    return (motion.root @ error[..., None])[..., 0], motion.root @ here, motion.root @ there
+
+
+def rotation_vector(R: Array) -> Array:
+    """Returns the rotation vectors (n, 3) of rotations (n, 3, 3) by less than half a turn, rad."""
+    twice_sine = np.stack(
+        [R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]]
+    )
+    sine = np.sqrt((twice_sine**2).sum(axis=0)) / 2
+    angle = np.arctan2(sine, (np.trace(R, axis1=1, axis2=2) - 1) / 2)
+    return (twice_sine * np.where(sine > 1e-9, angle / np.maximum(2 * sine, 1e-300), 0.5)).T
