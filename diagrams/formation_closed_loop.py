@@ -40,7 +40,7 @@ def straight_ahead(moves: int) -> tuple[str, ...]:
         "sight=projected",
         f"destination=[{end:g}, 0.65]",
         f"world.arena.ground={2 * end + 10:g}",
-        f"duration={150 * moves}",
+        f"duration={_PATIENCE * moves:g}",
     )
 
 
@@ -60,4 +60,5 @@ def closed_loop(
     return run_study(study, runs=runs, out=folder, workers=workers)
 
 
+_PATIENCE = 80.0  # s for a move; it takes 50
 _FRONT = 2.25  # m, where the foremost robot stands at the start
