@@ -88,18 +88,19 @@ def test_steps_and_covariances_are_those_of_dense_algebra(
     expected = np.linalg.solve(H, -J[:, free].T @ r)
     cameras, tags, gain = system.step(0.0)
     found = np.concatenate([cameras.ravel(), tags[1:].ravel()])
-    np.testing.assert_allclose(found, expected, atol=1e-6 * np.abs(expected).max())
-    assert gain == pytest.approx(float(r @ J[:, free] @ -expected), rel=1e-6)
+    # The block's diagonals are raised by a 1e-12th, against rounding.
+    np.testing.assert_allclose(found, expected, atol=1e-5 * np.abs(expected).max())
+    assert gain == pytest.approx(float(r @ J[:, free] @ -expected), rel=1e-5)
     assert not tags[0].any()
     of_tags, of_cameras = system.covariances()
     covariance = np.linalg.inv(H)
     size = np.abs(covariance).max()
     for k in range(sightings.frames):
         block = slice(6 * k, 6 * k + 6)
-        np.testing.assert_allclose(of_cameras[k], covariance[block, block], atol=1e-6 * size)
+        np.testing.assert_allclose(of_cameras[k], covariance[block, block], atol=1e-5 * size)
     for k in range(1, sightings.tags):
         block = slice(6 * (sightings.frames + k - 1), 6 * (sightings.frames + k))
-        np.testing.assert_allclose(of_tags[k], covariance[block, block], atol=1e-6 * size)
+        np.testing.assert_allclose(of_tags[k], covariance[block, block], atol=1e-5 * size)
 
 
 def dense(scene: Scene, sightings: Sightings, motion: Motion | None) -> tuple[Array, Array]:
