@@ -14,7 +14,7 @@ from pydrake.systems.primitives import ConstantVectorSource
 
 from diagrams.formation_faults import COMMAND, faults_of
 from diagrams.formation_metrics import FormationLog, formation_metrics
-from diagrams.formation_recording import REPEAT, look_rate, record_estimates
+from diagrams.formation_recording import look_rate, record_estimates
 from diagrams.formation_sensing import (
     add_obstacles,
     obstacle_metrics,
@@ -69,7 +69,7 @@ class FormationMission(Mission):
         controllers = [f"controller_{k + 1}" for k in range(scenario.robots)]
         deciding = [*controllers, "turns", *filter(wiring.has_block, ["estimator"])]
         rate = look_rate(wiring.block(name) for name in deciding)
-        self.recorder = wiring.add_recorder(out, rate=rate, repeat=REPEAT)
+        self.recorder = wiring.add_recorder(out, rate=rate)
         self.diagram, self.logs = wiring.build("formation")
 
     def _add_blocks(self) -> None:

@@ -21,7 +21,6 @@ Array = NDArray[np.float64]
 
 RATE = 5.0  # Hz, of the estimates: moves take half a minute
 _FASTEST = 200.0  # Hz, at which a recorder looks
-REPEAT = 1.0  # s; three robots of four stand, and most that could be recorded does not change
 
 
 def record_estimates(wiring: Wiring, names: Sequence[str]) -> None:

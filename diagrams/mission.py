@@ -33,6 +33,7 @@ from systems.validation import nearest
 Array = NDArray[np.float64]
 
 LOG_RATE = 50.0  # Hz
+_REPEAT = 1.0  # s; a robot that stands has little to say, and its command changes rarely
 FRAME_RATE = 20.0  # Hz, of what Meshcat shows and the replay keeps
 
 
@@ -103,14 +104,14 @@ class Wiring:
 
     def has_output(self, name: str) -> bool:
         """Whether there is such an output port."""
-        if name in self._watched or name in _port_names(self.station, "Output"):
+        if name in self._watched or self.station.HasOutputPort(name):
             return True
         block, _, port = name.partition(".")
-        return block in self._blocks and port in _port_names(self._blocks[block], "Output")
+        return block in self._blocks and self._blocks[block].HasOutputPort(port)
 
     def has_input(self, name: str) -> bool:
         """Whether the station has such an input port."""
-        return name in _port_names(self.station, "Input")
+        return bool(self.station.HasInputPort(name))
 
     def has_block(self, name: str) -> bool:
         """Whether a block was added under that name."""
@@ -147,7 +148,7 @@ class Wiring:
     def connect_if_wanted(self, source: str, target: str) -> None:
         """Connects two ports if the target block, a user's perhaps, has that input at all."""
         block, _, port = target.partition(".")
-        if port in _port_names(self._blocks[block], "Input"):
+        if self._blocks[block].HasInputPort(port):
             self.connect(source, target)
 
     def log(self, name: str, rate: float = LOG_RATE) -> None:
@@ -160,10 +161,10 @@ class Wiring:
         self._signals.append(signal)
         self._sources[signal.port] = source
 
-    def add_recorder(
-        self, out: Path | None, *, rate: float | None = None, repeat: float = 0.0
-    ) -> Recorder | None:
+    def add_recorder(self, out: Path | None, *, rate: float | None = None) -> Recorder | None:
         """Adds the recorder of all signals, if the scenario wants a recording.
+
+        A vector that does not change is recorded once a second.
 
         The recording of an earlier run in the same folder is replaced.
 
@@ -171,7 +172,6 @@ class Wiring:
             out: folder of the run; None records nothing.
             rate: at which the recorder looks at what is played back, Hz, see `Signal.channel`, and
                 at most at all else; by default that of the fastest signal.
-            repeat: vectors that do not change are recorded once in so long, s; 0: always.
 
         Raises:
             ValueError: the folder cannot be written, or holds the recording that is played.
@@ -193,7 +193,7 @@ class Wiring:
         signals = [replace(signal, rate=min(signal.rate, looks)) for signal in signals]
         recorder = self.add(
             Recorder(
-                channels=[signal.channel(looks, repeat) for signal in signals],
+                channels=[signal.channel(looks, _REPEAT) for signal in signals],
                 writer=BagWriter(out / "bag"),
                 static=self.station.static_messages,
             ),
@@ -213,7 +213,7 @@ class Wiring:
         return diagram, self._logs
 
     def _port(self, name: str, kind: str) -> Any:
-        if name in _port_names(self.station, kind):
+        if getattr(self.station, f"Has{kind}Port")(name):
             return getattr(self.station, f"Get{kind}Port")(name)
         block, _, port = name.partition(".")
         owner = self._blocks.get(block, self.station)

@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context
 
 from diagrams.mission import FRAME_RATE, Mission
 from diagrams.scenario import Scenario, save_scenario
+from systems.compiled import prepare
 from systems.validation import require_non_negative
 
 # Of a run; a team's other robots have theirs with their names.
@@ -93,6 +94,7 @@ def simulate(
             for path in out.glob(pattern):
                 path.unlink()
         save_scenario(scenario, out / "scenario.yaml")
+    prepare()  # or the first pictures would wait for the compiler
     gc.freeze()  # diagram and modules stay: to look through them again and again costs 5 %
     try:
         outcome, context, wall = _advance(scenario, mission, realtime, progress)

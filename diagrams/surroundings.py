@@ -161,7 +161,7 @@ def clearance_signal(robot: str) -> Signal:
         encode=lambda value, _: message_class("std_msgs/msg/Float64")(float(value[0])),
         decode=_number,
         model=1,
-        rate=50.0,
+        rate=10.0,
         played=False,
     )
 

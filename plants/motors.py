@@ -7,6 +7,7 @@ a millisecond, the robot's is tens of them.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
+from systems.compiled import compiled, in_rows
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -141,13 +143,15 @@ class MotorModel:
             speed: of the wheel, rad/s.
         """
         p = self.parameters
-        d, emf = np.asarray(duty, float), self.back_emf * np.asarray(speed, float)
-        if p.chopped == "enable":
-            driving = p.battery_voltage - p.bridge_voltage - np.sign(d) * emf
-            return np.asarray(d * np.maximum(driving, 0.0) / self.resistance)
-        over = d * p.battery_voltage - emf
-        driving = np.maximum(np.abs(over) - p.bridge_voltage, 0.0)
-        return np.asarray(np.sign(over) * driving / self.resistance)
+        d, emf = np.asarray(duty, float), np.asarray(self.back_emf * np.asarray(speed, float))
+        if d.shape != emf.shape:
+            d, emf = np.broadcast_arrays(d, emf)
+        voltages = np.empty(d.size)
+        _voltages(
+            in_rows(d), in_rows(emf), p.battery_voltage, p.bridge_voltage,
+            p.chopped == "enable", voltages,
+        )  # fmt: skip
+        return voltages.reshape(d.shape) / self.resistance
 
     def torque(self, duty: ArrayLike, speed: ArrayLike) -> Array:
         """Returns the torque at the wheel before the gear's friction, N m (see `current`)."""
@@ -185,6 +189,21 @@ class MotorModel:
         else:
             size = (emf + p.bridge_voltage + self._voltage_lost) / p.battery_voltage
         return np.asarray(np.sign(speed) * np.minimum(size, 1.0))
+
+
+@compiled("void(f8[::1], f8[::1], f8, f8, b1, f8[::1])")
+def _voltages(
+    duty: Array, emf: Array, battery: float, bridge: float, at_enable: bool, voltages: Array
+) -> None:
+    """Writes the mean voltage over the resistance (see `MotorModel.current`)."""
+    for k in range(len(duty)):
+        d = duty[k]
+        if at_enable:
+            against = emf[k] if d > 0 else -emf[k]
+            voltages[k] = d * max(battery - bridge - against, 0.0)
+        else:
+            over = d * battery - emf[k]
+            voltages[k] = math.copysign(max(abs(over) - bridge, 0.0), over)
 
 
 class DcMotors(LeafSystem):

@@ -17,6 +17,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from systems.compiled import compiled, packed
+
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
@@ -48,8 +50,8 @@ class PlanarShapes:
     def _set(self, centres: ComplexArray, turns: ComplexArray, halves: Array, radii: Array) -> None:
         self._centres = centres
         self._turns = turns
-        self._halves = halves  # (n, 2) of length and width
-        self._radii = radii
+        self._halves = packed(halves)  # (n, 2) of length and width
+        self._radii = packed(radii)
         length, width = halves.T
         corners = _CORNERS.real[:, None] * length + 1j * _CORNERS.imag[:, None] * width
         self._corners = corners * turns  # (4, n) about the centres
@@ -104,21 +106,13 @@ class PlanarShapes:
 
         It is negative where they overlap, by the length of the shortest push that parts them.
         """
-        between = others._centres - self._centres[:, None]  # (n, m)
-        # The corners of each shape, seen from the frame of the other's core, and the other way.
-        corners = np.empty((2, 4, *between.shape), complex)
-        corners[0] = (between + others._corners[:, None]) * self._turns.conj()[:, None]
-        corners[1] = (self._corners[:, :, None] - between) * others._turns.conj()
-        cores = np.empty((2, 1, *between.shape, 2))
-        cores[0, 0] = self._halves[:, None]
-        cores[1, 0] = others._halves
-        xy = corners.view(float).reshape(*corners.shape, 2)
-        # Far to one side or the other: corners are symmetric about their centre, which is not zero.
-        beyond = np.maximum(xy.min(axis=1), -xy.max(axis=1)) - cores[:, 0]
-        gap = beyond.max(axis=(0, 3))
-        outside = np.maximum(np.abs(xy) - cores, 0)
-        apart = np.sqrt((outside * outside).sum(axis=4).min(axis=(0, 1)))
-        return np.where(gap > 0, apart, gap) - self._radii[:, None] - others._radii
+        distances = np.empty((len(self), len(others)))
+        _distances(*self._cores, *others._cores, distances)
+        return distances
+
+    @property
+    def _cores(self) -> tuple[ComplexArray, ComplexArray, ComplexArray, Array, Array]:
+        return self._centres, self._turns, self._corners, self._halves, self._radii
 
     def distances_from(self, points: Array) -> Array:
         """Returns the distance of each shape from each of the points (m, 2), (n, m) m.
@@ -131,3 +125,57 @@ class PlanarShapes:
         y = np.abs(local.imag) - self._halves[:, 1:]
         outside = np.hypot(np.maximum(x, 0), np.maximum(y, 0))
         return np.asarray(outside + np.minimum(np.maximum(x, y), 0) - self._radii[:, None])
+
+
+@compiled(
+    "void(c16[::1], c16[::1], c16[:,::1], f8[:,::1], f8[::1],"
+    " c16[::1], c16[::1], c16[:,::1], f8[:,::1], f8[::1], f8[:,::1])"
+)
+def _distances(
+    centres: ComplexArray,
+    turns: ComplexArray,
+    corners: ComplexArray,
+    halves: Array,
+    radii: Array,
+    other_centres: ComplexArray,
+    other_turns: ComplexArray,
+    other_corners: ComplexArray,
+    other_halves: Array,
+    other_radii: Array,
+    distances: Array,
+) -> None:
+    for i in range(len(centres)):
+        for j in range(len(other_centres)):
+            between = other_centres[j] - centres[i]
+            gap, apart = _core_gap(between, turns[i], halves[i], other_corners[:, j])
+            gap_back, apart_back = _core_gap(
+                -between, other_turns[j], other_halves[j], corners[:, i]
+            )
+            gap = max(gap, gap_back)
+            if gap > 0:
+                gap = min(apart, apart_back)
+            distances[i, j] = gap - radii[i] - other_radii[j]
+
+
+@compiled()
+def _core_gap(
+    between: complex, turn: complex, half: Array, corners: ComplexArray
+) -> tuple[float, float]:
+    """Looks at another core's corners from the frame of one.
+
+    Returns:
+        How far the other is beyond a side of the core, where it is farthest (negative when it is
+        beyond none), and the least distance of its corners from the core, m.
+    """
+    low_x, high_x, low_y, high_y = math.inf, -math.inf, math.inf, -math.inf
+    square = math.inf
+    back = turn.conjugate()
+    for k in range(4):
+        corner = (between + corners[k]) * back
+        x, y = corner.real, corner.imag
+        low_x, high_x = min(low_x, x), max(high_x, x)
+        low_y, high_y = min(low_y, y), max(high_y, y)
+        dx, dy = max(abs(x) - half[0], 0.0), max(abs(y) - half[1], 0.0)
+        square = min(square, dx * dx + dy * dy)
+    beyond_x, beyond_y = max(low_x, -high_x) - half[0], max(low_y, -high_y) - half[1]
+    return max(beyond_x, beyond_y), math.sqrt(square)

@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from pydrake.systems.sensors import CameraInfo
 from ruamel.yaml import YAML, YAMLError
 
+from systems.compiled import in_rows
+from systems.plumb_bob import distort_all, find_rays
 from systems.validation import require
 
 Array = NDArray[np.float64]
@@ -88,6 +90,11 @@ class PinholeCamera:
         return bool(self.D.any())
 
     @cached_property
+    def matrices(self) -> tuple[Array, Array]:
+        """K (3, 3) and D (5,) for compiled code, which takes none that are read-only."""
+        return self.K.copy(), self.D.copy()
+
+    @cached_property
     def fold_radius(self) -> float:
         """How far from the axis (x/z, y/z) the distortion model holds; infinite for everywhere.
 
@@ -147,49 +154,17 @@ class PinholeCamera:
             cannot be inverted (a pixel beyond the model's fold); and (..., 2, 2) the derivative of
             the pixels by them, px.
         """
-        focal = self.K[[0, 1], [0, 1]]
-        target = (pixels - self.K[:2, 2]) / focal
-        if not self.distorted:
-            return target, np.broadcast_to(np.diag(focal), (*target.shape, 2))
-        # OpenCV's undistortPoints stops after five fixed-point steps; Newton's steps end at
-        # rounding error, and what does not converge is marked instead of returned.
-        guess = target
-        with np.errstate(all="ignore"):
-            for _ in range(20):
-                distorted, jacobian = self._distort(guess)
-                error = target - distorted
-                size = np.abs(error).max(initial=0.0)
-                a, b = jacobian[..., 0, 0], jacobian[..., 0, 1]
-                c, d = jacobian[..., 1, 0], jacobian[..., 1, 1]
-                ex, ey = error[..., 0], error[..., 1]
-                step = np.stack([d * ex - b * ey, a * ey - c * ex], axis=-1)
-                guess = guess + step / (a * d - b * c)[..., None]
-                if size < 1e-7:  # its square, which the step leaves, is below rounding
-                    break
-            # Beyond the fold the same pixel has other rays too, some on the far side of the axis.
-            right = np.hypot(guess[..., 0], guess[..., 1]) < self.fold_radius
-            if not size < 1e-9:
-                right &= np.abs(error).max(axis=-1) < 1e-6
-            if not right.all():
-                guess = np.where(right[..., None], guess, np.nan)
-        return guess, jacobian * focal[:, None]
+        flat = in_rows(pixels, 2)
+        rays, by_ray = np.empty(flat.shape), np.empty((len(flat), 2, 2))
+        find_rays(flat, *self.matrices, self.fold_radius, rays, by_ray)
+        return rays.reshape(pixels.shape), by_ray.reshape(*pixels.shape, 2)
 
     def _distort(self, normalised: Array) -> tuple[Array, Array]:
         """Applies plumb-bob distortion to (..., 2); also returns its (..., 2, 2) derivative."""
-        k1, k2, p1, p2, k3 = self.D.tolist()
-        x, y = normalised[..., 0], normalised[..., 1]
-        xx, yy, xy = x * x, y * y, x * y
-        r2 = xx + yy
-        radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-        slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial = slope (x dx + y dy)
-        distorted = np.empty(normalised.shape)
-        distorted[..., 0] = x * radial + 2 * p1 * xy + p2 * (r2 + 2 * xx)
-        distorted[..., 1] = y * radial + 2 * p2 * xy + p1 * (r2 + 2 * yy)
-        jacobian = np.empty((*x.shape, 2, 2))
-        jacobian[..., 0, 0] = radial + slope * xx + 2 * p1 * y + 6 * p2 * x
-        jacobian[..., 1, 1] = radial + slope * yy + 2 * p2 * x + 6 * p1 * y
-        jacobian[..., 0, 1] = jacobian[..., 1, 0] = slope * xy + 2 * (p1 * x + p2 * y)
-        return distorted, jacobian
+        flat = in_rows(normalised, 2)
+        distorted, jacobian = np.empty(flat.shape), np.empty((len(flat), 2, 2))
+        distort_all(flat, self.matrices[1], distorted, jacobian)
+        return distorted.reshape(normalised.shape), jacobian.reshape(*normalised.shape, 2)
 
     def to_drake(self) -> CameraInfo:
         """Returns Drake's `CameraInfo` of the undistorted camera; the half pixel is added here."""

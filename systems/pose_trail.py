@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.compiled import compiled, packed
 from systems.messages import Scan
 
 Array = NDArray[np.float64]
@@ -59,10 +60,17 @@ def ray_poses(scan: Scan, lidar_pose: Array, trail: Array) -> Array:
     Returns:
         (n, 3) [x (m), y (m), direction (rad)].
     """
-    body = poses_at(trail, scan.stamp + scan.time_increment * np.arange(len(scan), dtype=float))
-    c, s = np.cos(body[:, 2]), np.sin(body[:, 2])
-    x = body[:, 0] + c * lidar_pose[0] - s * lidar_pose[1]
-    y = body[:, 1] + s * lidar_pose[0] + c * lidar_pose[1]
-    rays = np.empty((len(scan), 3))
-    rays[:, 0], rays[:, 1], rays[:, 2] = x, y, body[:, 2] + lidar_pose[2] + scan.angles
+    times = scan.stamp + scan.time_increment * np.arange(len(scan), dtype=float)
+    rays = poses_at(trail, times)
+    _carry(rays, packed(lidar_pose), packed(scan.angles))
     return rays
+
+
+@compiled("void(f8[:,::1], f8[::1], f8[::1])")
+def _carry(poses: Array, lidar_pose: Array, angles: Array) -> None:
+    """Turns poses of the body (n, 3) into those of its lidar's rays."""
+    for k in range(len(poses)):
+        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
+        poses[k, 0] += c * lidar_pose[0] - s * lidar_pose[1]
+        poses[k, 1] += s * lidar_pose[0] + c * lidar_pose[1]
+        poses[k, 2] += lidar_pose[2] + angles[k]

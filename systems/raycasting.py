@@ -1,10 +1,7 @@
 """Ray casting against the solids of a scene, which Drake itself does not offer.
 
-A ray is tried only against the solids that it may meet. For a few rays and solids those are the
-ones whose bounding sphere it meets. Many rays from one place (or nearly) are sorted by their
-azimuth about the vertical: from there a solid is seen within an interval of azimuths, that of the
-corners of its bounding box. So the turn of a lidar, 360 rays among 100 solids, costs a thousand
-trials, not 36,000. What a trial does is in `systems.solid_shapes`.
+Each ray is tried against each solid whose bounding sphere it meets; what a trial does is in
+`systems.solid_shapes`.
 
 Touching a solid without entering it may count as a hit or as a miss: rounding decides.
 """
@@ -12,6 +9,7 @@ Touching a solid without entering it may count as a hit or as a miss: rounding d
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Collection, Sequence
 from typing import Any, Self
 
@@ -22,13 +20,12 @@ from pydrake.geometry import FrameId, QueryObject, Role, SceneGraphInspector, Sh
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, LeafSystem, ValueProducer
 
+from systems.compiled import compiled, in_rows
 from systems.solid_shapes import (
     CAPSULE,
-    HULL,
     ROUND_BOX,
     TINY,
     describe,
-    enter_box,
     enter_capsule,
     enter_hull,
     enter_round_box,
@@ -38,22 +35,8 @@ from systems.validation import require
 Array = NDArray[np.float64]
 Index = NDArray[np.intp]
 
-# The corners of the unit cube.
-_CORNERS = np.array(np.meshgrid([-1.0, 1], [-1.0, 1], [-1.0, 1])).reshape(3, 8).T
-# So many pairs of solids and rays are sooner tried each than sorted.
-_FEW = 12_000
-# Pairs that are tried at once: larger arrays go back to the system each time, and fetching them
-# anew takes a quarter longer.
-_BLOCK = 2000
-# Rounding must not turn away a ray that only just meets what holds a solid: part, and rad.
+# Rounding must not turn away a ray that only just meets what holds a solid.
 _SLACK = 1e-9
-
-
-def _runs(starts: Index, counts: Index) -> tuple[Index, Index]:
-    """Returns the runs [start, start + count) in one row: which run, and the number in it."""
-    run = np.repeat(np.arange(len(counts)), counts)
-    shift = starts - (np.cumsum(counts) - counts)
-    return run, np.arange(len(run)) + shift[run]
 
 
 class Solids:
@@ -71,33 +54,31 @@ class Solids:
     def __init__(self, shapes: Sequence[Shape], poses: Sequence[RigidTransform]) -> None:
         require(len(poses) == len(shapes), "poses", len(poses), f"{len(shapes)}, one a shape")
         described = [(i, describe(shape)) for i, shape in enumerate(shapes)]
-        kept = sorted(((i, s) for i, s in described if s is not None), key=lambda e: e[1].kind)
+        kept = [(i, solid) for i, solid in described if solid is not None]
         solids = [solid for _, solid in kept]
         self._order = np.array([i for i, _ in kept], np.intp)
         k = len(kept)
         X = np.array([poses[i].GetAsMatrix34() for i in self._order]).reshape(k, 3, 4)
         centres = np.array([solid.centre for solid in solids]).reshape(k, 3)
-        self._scales = np.array([solid.scale for solid in solids]).reshape(k, 3)
-        self._extents = np.array([solid.extent for solid in solids]).reshape(k, 3)
-        self._extents *= 1 + _SLACK
-        self._radii = np.array([solid.radius for solid in solids]) * (1 + _SLACK)
+        scales = np.array([solid.scale for solid in solids]).reshape(k, 3)
         self._centres = np.einsum("kij,kj->ki", X[:, :, :3], centres) + X[:, :, 3]
-        # World to unit shape, without the shift by the centre: (3, 3, k), as gathering is fastest.
-        self._to_unit = np.ascontiguousarray(
-            (X[:, :, :3] / self._scales[:, None, :]).transpose(2, 1, 0)
+        # World to unit shape, without the shift by the centre.
+        self._to_unit = (X[:, :, :3] / scales[:, None, :]).transpose(0, 2, 1).copy()
+        counts = np.array([len(solid.faces) for solid in solids], np.intp)
+        # What of a solid does not depend on where it is; see `_cast`.
+        self._shapes = (
+            np.array([solid.radius for solid in solids], float) * (1 + _SLACK),
+            np.array([solid.kind for solid in solids], np.intp),
+            np.array([solid.dimensions for solid in solids], np.intp),
+            np.array([solid.ratio for solid in solids], float),
+            np.cumsum(counts) - counts,
+            counts,
+            np.concatenate([np.zeros((0, 4)), *(solid.faces for solid in solids)]),
         )
-        self._parts = np.array([solid.part[:, 0] for solid in solids]).reshape(k, 3).T.copy()
-        self._ratios = np.array([solid.ratio for solid in solids])
-        kinds = np.array([solid.kind for solid in solids], int)
-        self._kinds = np.searchsorted(kinds, (ROUND_BOX, CAPSULE, HULL))
-        hulls = solids[self._kinds[-1] :]
-        self._faces = np.concatenate([np.zeros((0, 4)), *(hull.faces for hull in hulls)]).T.copy()
-        self._face_counts = np.array([len(hull.faces) for hull in hulls], np.intp)
-        self._face_starts = np.cumsum(self._face_counts) - self._face_counts
 
     def __len__(self) -> int:
         """Number of solids that can be hit."""
-        return len(self._radii)
+        return len(self._order)
 
     def carried(self, X: Array) -> Solids:
         """Returns the same solids, each carried along by a rigid motion of its own.
@@ -109,8 +90,7 @@ class Solids:
         R = X[:, :, :3]
         carried = copy.copy(self)
         carried._centres = (R @ self._centres[:, :, None])[:, :, 0] + X[:, :, 3]
-        to_unit = self._to_unit.transpose(2, 0, 1) @ R.transpose(0, 2, 1)
-        carried._to_unit = np.ascontiguousarray(to_unit.transpose(1, 2, 0))
+        carried._to_unit = self._to_unit @ R.transpose(0, 2, 1)
         return carried
 
     def first_hit(
@@ -139,28 +119,15 @@ class Solids:
             (n,) m, and (n,) the solid's number in the constructor's lists; -1 where the distance
             is inf.
         """
-        distances = np.full(len(directions), np.inf)
-        entered = np.full(len(directions), -1, np.intp)
-        if len(self) == 0 or len(directions) == 0:
-            return distances, entered
-        # About the first origin, which keeps the digits of rays far from the world's origin.
-        origins = np.atleast_2d(origins)
-        base = origins[0]
-        offsets = origins - base if len(origins) > 1 else None
-        c = self._centres - base
-        few = len(self) * len(directions) <= _FEW
-        candidates = self._meet_spheres if few else self._see_azimuths
-        solid, ray = candidates(c, offsets, directions, float(np.max(max_range)))
-        blocks = [slice(i, i + _BLOCK) for i in range(0, len(solid), _BLOCK)] or [slice(0)]
-        enter = np.concatenate(
-            [self._enter(c, offsets, directions, solid[block], ray[block]) for block in blocks]
-        )
-        hit = np.flatnonzero(enter >= 0)  # else it starts inside or beyond, or misses
-        solid, ray, enter = solid[hit], ray[hit], enter[hit]
-        np.minimum.at(distances, ray, enter)
-        distances[distances > max_range] = np.inf
-        first = np.flatnonzero(enter == distances[ray])
-        entered[ray[first]] = self._order[solid[first]]
+        n = len(directions)
+        distances, entered = np.empty(n), np.empty(n, np.intp)
+        reach = np.array(np.broadcast_to(max_range, n), float)
+        _cast(
+            self._centres, self._to_unit, *self._shapes,
+            in_rows(np.asarray(origins), 3), in_rows(directions, 3), reach, distances, entered,
+        )  # fmt: skip
+        hit = entered >= 0
+        entered[hit] = self._order[entered[hit]]
         return distances, entered
 
     def occluded(
@@ -182,105 +149,77 @@ class Solids:
         directions = rays / np.maximum(distances, TINY)[:, None]
         return np.isfinite(self.first_hit(origin, directions, distances - tolerance))
 
-    def _meet_spheres(
-        self, c: Array, offsets: Array | None, directions: Array, reach: float
-    ) -> tuple[Index, Index]:
-        """Pairs each ray with the solids whose bounding sphere it meets; see `_see_azimuths`."""
-        r = self._radii[:, None]
-        along = c @ directions.T  # how far along the ray its closest point to the centre lies
-        square = (c * c).sum(axis=1, keepdims=True)
-        near = np.sqrt(square) - r <= reach
-        if offsets is not None:
-            along -= (offsets * directions).sum(axis=1)
-            norms = (offsets * offsets).sum(axis=1)
-            near = np.sqrt(square) - r <= reach + np.sqrt(norms.max())
-            square = square - 2 * c @ offsets.T + norms
-        near = near & (along > -r)
-        along *= along
-        near &= along >= square - r * r
-        # Divided by hand: nonzero of two dimensions takes nine times as long.
-        solid, ray = np.divmod(np.flatnonzero(near), near.shape[1])
-        return solid, ray
 
-    def _see_azimuths(
-        self, c: Array, offsets: Array | None, directions: Array, reach: float
-    ) -> tuple[Index, Index]:
-        """Pairs solids with the rays whose azimuth and height they may be met at.
+@compiled(
+    "void(f8[:,::1], f8[:,:,::1], f8[::1], i8[::1], i8[::1], f8[::1], i8[::1], i8[::1],"
+    " f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8[::1])"
+)
+def _cast(
+    centres: Array,
+    to_unit: Array,
+    radii: Array,
+    kinds: Index,
+    dimensions: Index,
+    ratios: Array,
+    starts: Index,
+    counts: Index,
+    faces: Array,
+    origins: Array,
+    directions: Array,
+    reach: Array,
+    distances: Array,
+    entered: Index,
+) -> None:
+    """Writes how far n rays get and which of k solids they enter then: inf and -1 for none.
 
-        Args:
-            c: (k, 3) centres of the solids from the place that the rays are sorted about, m.
-            offsets: (n, 3) where the rays start, from there, m; None for all there.
-            directions: (n, 3).
-            reach: how far the rays go, m.
-
-        Returns:
-            Index of the solid (ascending) and of the ray.
-        """
-        n = len(directions)
-        # A ray that starts beside the place sees a solid where the place sees a larger one.
-        spread = 0.0 if offsets is None else float(np.sqrt((offsets**2).sum(axis=1).max()))
-        half = self._extents + spread
-        along, across, up = c.T
-        with np.errstate(invalid="ignore"):  # NaN, of an endless solid: every ray may meet it
-            axes = self._to_unit * (self._scales * half).T[:, None, :]  # (axis, world, k)
-            x, y = (_CORNERS @ axes[:, w] + c[:, w] for w in (0, 1))
-            # Azimuths of the corners from that of the centre. A solid in whose outline the place
-            # does not lie spans less than half a turn.
-            turn = np.arctan2(along * y - across * x, along * x + across * y)
-            first = turn.min(axis=0)
-            width = turn.max(axis=0) - first
-            beside = (width < np.pi) & (along * along + across * across > 0)
-            height = np.abs(axes[:, 2]).sum(axis=0)
-            distance = np.sqrt((c * c).sum(axis=1))
-            far = np.minimum(distance + self._radii + spread, reach)
-            missed = distance - self._radii > reach + spread
-            missed |= up - height > far * max(directions[:, 2].max(), 0.0)
-            missed |= up + height < far * min(directions[:, 2].min(), 0.0)
-        azimuths = np.arctan2(directions[:, 1], directions[:, 0])
-        order = np.argsort(azimuths, kind="stable")
-        azimuths = azimuths[order]
-        twice = np.concatenate([azimuths, azimuths + 2 * np.pi])
-        start = np.where(beside, np.arctan2(across, along) + first, 0.0) - _SLACK
-        start -= 2 * np.pi * np.floor((start + np.pi) / (2 * np.pi))
-        begin = np.where(beside, twice.searchsorted(start), 0)
-        end = np.where(beside, twice.searchsorted(start + width + 2 * _SLACK), n)
-        solid, place = _runs(begin, np.where(missed, 0, end - begin))
-        return solid, np.concatenate([order, order])[place]
-
-    def _enter(
-        self, c: Array, offsets: Array | None, directions: Array, solid: Index, ray: Index
-    ) -> Array:
-        """Returns where each pair's ray enters the pair's solid; NaN for a miss.
-
-        The solids are in ascending order; for the other arguments see `_see_azimuths`.
-        """
-        to_unit = self._to_unit.take(solid, axis=2)
-        o = -np.einsum("ijk,kj->ik", self._to_unit, c).take(solid, axis=1)
-        if offsets is not None:
-            o += np.einsum("ijn,jn->in", to_unit, offsets.T.take(ray, axis=1))
-        d = np.einsum("ijn,jn->in", to_unit, directions.T.take(ray, axis=1))
-        rounds, capsules, hulls = np.searchsorted(solid, self._kinds)
-        parts: list[Array] = []
-        with np.errstate(divide="ignore", invalid="ignore"):  # inf and NaN mean something here
-            if rounds > 0:
-                parts.append(enter_box(o[:, :rounds], d[:, :rounds]))
-            if capsules > rounds:
-                one = slice(rounds, capsules)
-                part = self._parts.take(solid[one], axis=1)
-                parts.append(enter_round_box(o[:, one], d[:, one], part))
-            if hulls > capsules:
-                one = slice(capsules, hulls)
-                parts.append(enter_capsule(o[:, one], d[:, one], self._ratios[solid[one]]))
-            if len(solid) > hulls:
-                faces, counts = self._faces_of(solid[hulls:] - self._kinds[-1])
-                parts.append(enter_hull(o[:, hulls:], d[:, hulls:], faces, counts))
-        return np.concatenate(parts) if parts else np.zeros(0)
-
-    def _faces_of(self, hull: Index) -> tuple[Array, Index]:
-        """Returns the faces of those hulls in one row, (4, ...), and how many each has."""
-        counts = self._face_counts[hull]
-        _, row = _runs(self._face_starts[hull], counts)
-        return self._faces.take(row, axis=1), counts
+    Args:
+        centres: (k, 3) of the solids, m.
+        to_unit: (k, 3, 3) from the world to the unit shape.
+        radii: (k,) of the spheres around the centres that hold them, m.
+        kinds: (k,) of `systems.solid_shapes`, as the next two.
+        dimensions: (k,) of round boxes.
+        ratios: (k,) of capsules.
+        starts: (k,) where a hull's faces begin.
+        counts: (k,) how many they are.
+        faces: (..., 4) of all hulls.
+        origins: (n or 1, 3) m.
+        directions: (n, 3).
+        reach: (n,) m.
+        distances: (n,) written, m.
+        entered: (n,) written.
+    """
+    c, o, d = np.empty(3), np.empty(3), np.empty(3)
+    for r in range(len(directions)):
+        start = 0 if len(origins) == 1 else r
+        nearest, first = math.inf, -1
+        for s in range(len(centres)):
+            along, square = 0.0, 0.0  # how far along the ray its closest point to the centre lies
+            for i in range(3):
+                c[i] = centres[s, i] - origins[start, i]
+                along += c[i] * directions[r, i]
+                square += c[i] * c[i]
+            radius = radii[s]
+            if (
+                along < -radius
+                or along - radius > min(nearest, reach[r])
+                or square - along * along > radius * radius
+            ):
+                continue
+            for i in range(3):
+                o[i], d[i] = 0.0, 0.0
+                for j in range(3):
+                    o[i] -= to_unit[s, i, j] * c[j]
+                    d[i] += to_unit[s, i, j] * directions[r, j]
+            if kinds[s] == ROUND_BOX:
+                t = enter_round_box(o, d, dimensions[s])
+            elif kinds[s] == CAPSULE:
+                t = enter_capsule(o, d, ratios[s])
+            else:
+                t = enter_hull(o, d, faces[starts[s] : starts[s] + counts[s]])
+            # Else it starts inside or beyond, or misses.
+            if t >= 0 and t <= reach[r] and t < nearest:
+                nearest, first = t, s
+        distances[r], entered[r] = nearest, first
 
 
 class SceneSolids:

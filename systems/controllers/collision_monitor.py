@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
+from systems.compiled import compiled, packed
 from systems.health import Counts
 from systems.messages import Scan
 from systems.pose_trail import empty_trail, ray_poses, remember
@@ -89,11 +90,16 @@ def clearance(points: Array, hull: Array) -> Array:
         hull: (3,) [front, rear, half_width] m: the rectangle from -rear to front along x, and half
             the width to either side.
     """
-    front, rear, half_width = hull
-    dx = np.abs(points[..., 0] - (front - rear) / 2) - (front + rear) / 2
-    dy = np.abs(points[..., 1]) - half_width
-    outside: Array = np.hypot(np.maximum(dx, 0), np.maximum(dy, 0))
-    return outside + np.minimum(np.maximum(dx, dy), 0)
+    distances = [_clearance(x, y, packed(hull)) for x, y in points.reshape(-1, 2).tolist()]
+    return np.array(distances).reshape(points.shape[:-1])
+
+
+@compiled("f8(f8, f8, f8[::1])")
+def _clearance(x: float, y: float, hull: Array) -> float:
+    front, rear, half_width = hull[0], hull[1], hull[2]
+    dx = abs(x - (front - rear) / 2) - (front + rear) / 2
+    dy = abs(y) - half_width
+    return max(dx, dy) if dx <= 0 or dy <= 0 else math.sqrt(dx * dx + dy * dy)
 
 
 def move(pose: Array, twist: Array, dt: float) -> Array:
@@ -125,26 +131,47 @@ def stopping_paths(
     Returns:
         (c, n, 3) poses in the body's frame of now, evenly in time until all stand.
     """
+    return _stopping_paths(packed(commands), packed(sent), packed(held), _times(parameters))
+
+
+def _times(parameters: CollisionMonitorParameters) -> Array:
     p = parameters
-    change = np.array([p.deceleration, p.turn_deceleration])
+    return np.array((p.deceleration, p.turn_deceleration, p.reaction_time, p.slowdown_time))
 
-    def toward(start: Array, end: Array, dt: Array) -> Array:
-        reach = change * dt[:, None]
-        return start + np.minimum(np.maximum(end - start, -reach), reach)
 
-    fastest = np.abs(np.vstack([commands, sent, held])).max(axis=0)
-    brake = p.reaction_time + p.slowdown_time
-    n = math.ceil((brake + float((fastest / change).max())) / _STEP)
-    t = (np.arange(n) + 0.5) * _STEP
-    speed = toward(sent, held, np.minimum(t, p.reaction_time))
-    following = np.minimum(np.maximum(t - p.reaction_time, 0), p.slowdown_time)
-    speed = toward(speed, commands[:, None], following)
-    speed = toward(speed, np.zeros(2), np.maximum(t - brake, 0))
-    turned = np.cumsum(speed[..., 1] * _STEP, axis=-1)
-    heading = turned - speed[..., 1] * _STEP / 2
-    x = np.cumsum(speed[..., 0] * np.cos(heading) * _STEP, axis=-1)
-    y = np.cumsum(speed[..., 0] * np.sin(heading) * _STEP, axis=-1)
-    return np.stack([x, y, turned], axis=-1)
+@compiled()
+def _toward(start: float, end: float, change: float) -> float:
+    return start + min(max(end - start, -change), change)
+
+
+@compiled("f8[:,:,::1](f8[:,::1], f8[::1], f8[::1], f8[::1])")
+def _stopping_paths(commands: Array, sent: Array, held: Array, times: Array) -> Array:
+    reaction, slowdown = times[2], times[3]
+    longest = 0.0
+    for i in range(2):
+        fastest = max(abs(sent[i]), abs(held[i]))
+        for k in range(len(commands)):
+            fastest = max(fastest, abs(commands[k, i]))
+        longest = max(longest, fastest / times[i])
+    n = math.ceil((reaction + slowdown + longest) / _STEP)
+    paths = np.empty((len(commands), n, 3))
+    speed = np.empty(2)
+    for k in range(len(commands)):
+        x, y, turned = 0.0, 0.0, 0.0
+        for j in range(n):
+            t = (j + 0.5) * _STEP
+            following = min(max(t - reaction, 0.0), slowdown)
+            braking = max(t - reaction - slowdown, 0.0)
+            for i in range(2):
+                now = _toward(sent[i], held[i], times[i] * min(t, reaction))
+                now = _toward(now, commands[k, i], times[i] * following)
+                speed[i] = _toward(now, 0.0, times[i] * braking)
+            heading = turned + speed[1] * _STEP / 2
+            x += speed[0] * math.cos(heading) * _STEP
+            y += speed[0] * math.sin(heading) * _STEP
+            turned += speed[1] * _STEP
+            paths[k, j, 0], paths[k, j, 1], paths[k, j, 2] = x, y, turned
+    return paths
 
 
 def are_safe(
@@ -169,29 +196,54 @@ def are_safe(
         hull: see `clearance`.
         parameters: margins, times and decelerations.
     """
-    paths = stopping_paths(commands, sent, held, parameters)
-    reach = np.hypot(max(hull[0], hull[1]), hull[2]) + parameters.margin
-    reach += np.hypot(paths[..., 0], paths[..., 1]).max()
-    points = points[np.hypot(points[:, 0], points[:, 1]) < reach]
-    if len(points) == 0:
-        return np.ones(len(commands), bool)
-    now = clearance(points, hull)
-    driving = min(max(now.min(), parameters.contact_margin), parameters.margin)
-    room = np.where(commands[:, 0] == 0, parameters.contact_margin, driving)
-    limit = np.minimum(room[:, None, None], now) - _FUZZ
-    c, s = np.cos(paths[..., 2, None]), np.sin(paths[..., 2, None])
-    x = points[:, 0] - paths[..., 0, None]
-    y = points[:, 1] - paths[..., 1, None]
-    x, y = c * x + s * y, c * y - s * x
-    # The larger of the distances along the axes is a lower bound, and far cheaper.
-    dx = np.abs(x - (hull[0] - hull[1]) / 2) - (hull[0] + hull[1]) / 2
-    dy = np.abs(y) - hull[2]
-    doubtful = np.nonzero(np.maximum(dx, dy) < limit)
-    seen = np.stack([x[doubtful], y[doubtful]], axis=-1)
-    too_near = clearance(seen, hull) < np.broadcast_to(limit, x.shape)[doubtful]
-    safe = np.ones(len(commands), bool)
-    safe[doubtful[0][too_near]] = False
+    margins = np.array((parameters.margin, parameters.contact_margin))
+    safe = np.empty(len(commands), bool)
+    _are_safe(
+        packed(commands), packed(sent), packed(held), packed(points), packed(hull),
+        _times(parameters), margins, safe,
+    )  # fmt: skip
     return safe
+
+
+@compiled("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], b1[::1])")
+def _are_safe(
+    commands: Array,
+    sent: Array,
+    held: Array,
+    points: Array,
+    hull: Array,
+    times: Array,
+    margins: Array,
+    safe: NDArray[np.bool_],
+) -> None:
+    margin, contact = margins[0], margins[1]
+    paths = _stopping_paths(commands, sent, held, times)
+    reach = 0.0
+    for k in range(len(commands)):
+        for j in range(paths.shape[1]):
+            reach = max(reach, math.hypot(paths[k, j, 0], paths[k, j, 1]))
+    reach += math.hypot(max(hull[0], hull[1]), hull[2]) + margin
+    near, now, least = np.empty(len(points), np.intp), np.empty(len(points)), math.inf
+    n = 0
+    for m in range(len(points)):
+        if math.hypot(points[m, 0], points[m, 1]) < reach:
+            near[n], now[n] = m, _clearance(points[m, 0], points[m, 1], hull)
+            least = min(least, now[n])
+            n += 1
+    driving = min(max(least, contact), margin)
+    for k in range(len(commands)):
+        safe[k] = True
+        room = contact if commands[k, 0] == 0 else driving
+        for j in range(paths.shape[1]):
+            c, s = math.cos(paths[k, j, 2]), math.sin(paths[k, j, 2])
+            for m in range(n):
+                x, y = points[near[m], 0] - paths[k, j, 0], points[near[m], 1] - paths[k, j, 1]
+                there = _clearance(c * x + s * y, c * y - s * x, hull)
+                if there < min(room, now[m]) - _FUZZ:
+                    safe[k] = False
+                    break
+            if not safe[k]:
+                break
 
 
 def safe_command(

@@ -42,6 +42,10 @@ class WheelDriveParameters:
         require_non_negative(rest=self.rest)
 
 
+def _within(value: float, limit: float) -> float:
+    return min(max(value, -limit), limit)
+
+
 class WheelDrive(LeafSystem):
     """Samples the command, limits speed and acceleration, and tells the wheels.
 
@@ -82,8 +86,8 @@ class WheelDrive(LeafSystem):
         p = parameters or WheelDriveParameters()
         self._rest = p.rest
         self._max_wheel_speed = max_wheel_speed
-        self._limit = np.array([p.max_speed, p.max_turn_rate])
-        self._change = np.array([p.max_acceleration, p.max_turn_acceleration]) / p.rate
+        self._limit = [p.max_speed, p.max_turn_rate]
+        self._change = [p.max_acceleration / p.rate, p.max_turn_acceleration / p.rate]
         self._to_wheel_speeds = to_wheel_speeds
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._sent = self.DeclareDiscreteState(2)
@@ -112,25 +116,30 @@ class WheelDrive(LeafSystem):
         return self._counts.output_port
 
     def _sample(self, context: Context, discrete_state: DiscreteValues) -> None:
-        command = self._command_input.Eval(context)
-        if not np.isfinite(command).all():
+        command: list[float] = self._command_input.Eval(context).tolist()
+        if not all(map(math.isfinite, command)):
             self._counts.add(context, discrete_state, bad_command=1)
-            command = np.zeros(2)
+            command = [0.0, 0.0]
         if context.get_time() < self._rest:
-            command = np.zeros(2)
-        sent = context.get_discrete_state(self._sent).get_value()
-        if not (sent.any() or command.any()):
+            command = [0.0, 0.0]
+        sent: list[float] = context.get_discrete_state(self._sent).get_value().tolist()
+        if not (any(sent) or any(command)):
             return  # it stands: most robots of a formation do, most of the time
-        wanted = self._within_reach(np.minimum(np.maximum(command, -self._limit), self._limit))
-        changed = sent + np.minimum(np.maximum(wanted - sent, -self._change), self._change)
+        limited = map(_within, command, self._limit)
+        wanted = self._within_reach(list(limited))
+        steps = (
+            now + _within(then - now, change)
+            for now, then, change in zip(sent, wanted, self._change, strict=True)
+        )
         # Once more: on its way from one to the other it may leave what the wheels can do.
-        discrete_state.set_value(self._sent, self._within_reach(changed))
+        discrete_state.set_value(self._sent, self._within_reach(list(steps)))
 
-    def _within_reach(self, command: Array) -> Array:
+    def _within_reach(self, command: list[float]) -> list[float]:
         if math.isinf(self._max_wheel_speed):
             return command
-        fastest = float(np.max(np.abs(self._to_wheel_speeds(command))))
-        return command * min(1.0, self._max_wheel_speed / max(fastest, 1e-9))
+        fastest = max(map(abs, self._to_wheel_speeds(np.array(command))))
+        factor = min(1.0, self._max_wheel_speed / max(fastest, 1e-9))
+        return [value * factor for value in command]
 
     def _calc_wheel_speeds(self, context: Context, output: Any) -> None:
         output.SetFromVector(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -106,15 +107,15 @@ class GyroYaw(LeafSystem):
         if context.get_time() < self._dt / 2:
             return  # the sensor takes its first sample in this very moment
         sample = self._imu_input.Eval(context)
-        if not np.isfinite(sample).all():
+        if not math.isfinite(sum(sample.tolist())):
             self._counts.add(context, discrete_state, bad_imu=1)
             return
         total = context.get_discrete_state(self._sum).get_value()
         if total[6] < self._num_samples:
             discrete_state.set_value(self._sum, [*(total[:6] + sample), total[6] + 1])
             return
-        yaw = context.get_discrete_state(self._yaw).get_value()[0]
-        yaw = wrap(yaw + float(self._corrected(context)[2]) * self._dt)
+        yaw = float(context.get_discrete_state(self._yaw)[0])
+        yaw = wrap(yaw + (float(sample[2]) - float(total[2] / max(total[6], 1.0))) * self._dt)
         discrete_state.set_value(self._yaw, [yaw])
 
     def _calc_sample(self, context: Context, output: Any) -> None:

@@ -274,10 +274,8 @@ class PlanarEkf(LeafSystem):
             counts["bad_command"] += 1
             command, variance = [0.0, 0.0], p.lost_speed_noise**2
         motors = context.get_discrete_state(self._motors).get_value().tolist()
-        (v, speed), (omega, turn_rate) = (
-            lagged(before, target, p.speed_lag, dt)
-            for before, target in zip(motors, command, strict=True)
-        )
+        v, speed = lagged(motors[0], command[0], p.speed_lag, dt)
+        omega, turn_rate = lagged(motors[1], command[1], p.speed_lag, dt)
         discrete_state.set_value(self._motors, [v, omega])
         if self._wheel_speeds_input.HasValue(context):
             measured = p.wheel_radius * float(np.mean(self._wheel_speeds_input.Eval(context)))

@@ -16,8 +16,10 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.angles import planar_pose, wrap
+from systems.compiled import compiled, in_rows, packed
 from systems.health import Counts
 from systems.messages import PoseEstimate
+from systems.small_matrices import congruence
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -93,14 +95,38 @@ def predict(
     Returns:
         The predicted state and covariance.
     """
+    predicted, grown = np.empty(3), np.empty((3, 3))
+    q_v, q_theta = parameters.speed_noise**2 * dt, parameters.heading_noise**2 * dt
+    kept = 1.0 if parameters.rebase else 0.0
+    _predict(packed(x), in_rows(P, 3), v * dt, theta, q_v, q_theta, kept, predicted, grown)
+    return predicted, grown
+
+
+@compiled("void(f8[::1], f8[:,::1], f8, f8, f8, f8, f8, f8[::1], f8[:,::1])")
+def _predict(
+    x: Array,
+    P: Array,
+    step: float,
+    theta: float,
+    q_v: float,
+    q_theta: float,
+    kept: float,
+    predicted: Array,
+    grown: Array,
+) -> None:
     c, s = math.cos(x[2]), math.sin(x[2])
-    F = np.array([[1.0, 0.0, -v * dt * s], [0.0, 1.0, v * dt * c], [0.0, 0.0, 1.0]])
-    if not parameters.rebase:
-        F[2, 2] = 0.0
-    F_n = np.array([[c, 0.0], [s, 0.0], [0.0, 1.0]])
-    Q = np.array([parameters.speed_noise**2 * dt, parameters.heading_noise**2 * dt])  # diagonal
-    predicted = np.array([x[0] + v * dt * c, x[1] + v * dt * s, wrap(theta)])
-    return predicted, F @ P @ F.T + F_n * Q @ F_n.T
+    F = np.zeros((3, 3))
+    F[0, 0], F[0, 2] = 1.0, -step * s
+    F[1, 1], F[1, 2] = 1.0, step * c
+    F[2, 2] = kept
+    congruence(F, P, grown)
+    grown[0, 0] += c * q_v * c
+    grown[1, 1] += s * q_v * s
+    grown[0, 1] += c * q_v * s
+    grown[1, 0] += s * q_v * c
+    grown[2, 2] += q_theta
+    predicted[0], predicted[1] = x[0] + step * c, x[1] + step * s
+    predicted[2] = math.pi - (math.pi - theta) % (2 * math.pi)
 
 
 def mahalanobis(x: Array, P: Array, z: Array, R: Array) -> float:

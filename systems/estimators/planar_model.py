@@ -19,7 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.angles import wrap
+from systems.compiled import compiled, in_rows, packed
 from systems.estimators.planar_kalman import UNKNOWN, mahalanobis
+from systems.small_matrices import congruence
 
 Array = NDArray[np.float64]
 
@@ -27,7 +29,6 @@ SIZE = 6
 THETA, BIAS, SCALE, GYRO_SCALE = 2, 3, 4, 5
 
 _IDENTITY = np.eye(SIZE)
-_NO_POSITION_NOISE = np.diag([0.0, 0.0, 1.0, 1.0, 1.0, 1.0])
 
 
 class Drive(NamedTuple):
@@ -106,19 +107,9 @@ def predict(
     Returns:
         The state and F P F' + G Q G' after the step.
     """
-    F, G, predicted = linearize(x, drive, dt)
-    v, omega = abs(drive.speed), abs(drive.yaw_rate)
-    Q = np.array(
-        (
-            (noise.speed + noise.slip * v + drive.speed_variance) * dt,
-            noise.side * omega * dt,
-            ((noise.gyro + noise.turn * omega) * drive.gyro_weight + drive.turn_variance) * dt,
-            noise.bias * dt,
-            noise.scale * dt,
-            noise.gyro_scale * dt,
-        )
-    )
-    return predicted, F @ P @ F.T + G * Q @ G.T
+    predicted, grown = np.empty(SIZE), np.empty((SIZE, SIZE))
+    _predict(packed(x), in_rows(P, SIZE), *drive, dt, *noise, predicted, grown)
+    return predicted, grown
 
 
 def linearize(x: Array, drive: Drive, dt: float) -> tuple[Array, Array, Array]:
@@ -128,25 +119,77 @@ def linearize(x: Array, drive: Drive, dt: float) -> tuple[Array, Array, Array]:
         F: (6, 6) by the state. G: (6, 6) by what noise adds over the step: distance along and
         across the heading (m), heading (rad), bias (rad/s), scales. The state after it: (6,).
     """
-    px, py, theta, bias, scale, gyro_scale = x.tolist()
-    measured = (drive.yaw_rate - bias) * dt
+    F, G, predicted = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty(SIZE)
+    _linearize(packed(x), drive.speed, drive.yaw_rate, dt, F, G, predicted)
+    return F, G, predicted
+
+
+@compiled("void(f8[::1], f8, f8, f8, f8[:,::1], f8[:,::1], f8[::1])")
+def _linearize(
+    x: Array, speed: float, yaw_rate: float, dt: float, F: Array, G: Array, predicted: Array
+) -> None:
+    theta, bias, scale, gyro_scale = x[THETA], x[BIAS], x[SCALE], x[GYRO_SCALE]
+    measured = (yaw_rate - bias) * dt
     turn = gyro_scale * measured
     c, s = math.cos(theta + turn / 2), math.sin(theta + turn / 2)
-    by_scale_x, by_scale_y = drive.speed * dt * c, drive.speed * dt * s
+    by_scale_x, by_scale_y = speed * dt * c, speed * dt * s
     dx, dy = scale * by_scale_x, scale * by_scale_y
-    F = _IDENTITY.copy()
+    for i in range(SIZE):
+        for j in range(SIZE):
+            F[i, j] = G[i, j] = 1.0 if i == j else 0.0
+        predicted[i] = x[i]
     F[0, 2], F[1, 2] = -dy, dx
     # A change of the turn moves the heading, and half of it that of the middle.
     F[2, 3], F[2, 5] = -gyro_scale * dt, measured
     F[0, 3], F[1, 3] = dy * gyro_scale * dt / 2, -dx * gyro_scale * dt / 2
     F[0, 4], F[1, 4] = by_scale_x, by_scale_y
     F[0, 5], F[1, 5] = -dy * measured / 2, dx * measured / 2
-    G = _NO_POSITION_NOISE.copy()
     G[0, 0], G[1, 0] = c, s
     G[0, 1], G[1, 1] = -s, c
     # Turning noise comes evenly over the step: the middle has half of it.
     G[0, 2], G[1, 2] = -dy / 2, dx / 2
-    return F, G, np.array((px + dx, py + dy, wrap(theta + turn), bias, scale, gyro_scale))
+    predicted[0], predicted[1] = x[0] + dx, x[1] + dy
+    predicted[THETA] = math.pi - (math.pi - theta - turn) % (2 * math.pi)
+
+
+@compiled(
+    "void(f8[::1], f8[:,::1], f8, f8, f8, f8, f8, f8,"
+    " f8, f8, f8, f8, f8, f8, f8, f8, f8[::1], f8[:,::1])"
+)
+def _predict(
+    x: Array,
+    P: Array,
+    speed: float,
+    yaw_rate: float,
+    speed_variance: float,
+    turn_variance: float,
+    gyro_weight: float,
+    dt: float,
+    speed_noise: float,
+    slip_noise: float,
+    side_noise: float,
+    gyro_noise: float,
+    turn_noise: float,
+    bias_noise: float,
+    scale_noise: float,
+    gyro_scale_noise: float,
+    predicted: Array,
+    grown: Array,
+) -> None:
+    """Writes state and covariance after a step; the entries of `Drive`, dt, of `ProcessNoise`."""
+    F, G, noise = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE))
+    _linearize(x, speed, yaw_rate, dt, F, G, predicted)
+    v, omega = abs(speed), abs(yaw_rate)
+    Q = np.zeros((SIZE, SIZE))
+    Q[0, 0] = (speed_noise + slip_noise * v + speed_variance) * dt
+    Q[1, 1] = side_noise * omega * dt
+    Q[2, 2] = ((gyro_noise + turn_noise * omega) * gyro_weight + turn_variance) * dt
+    Q[3, 3], Q[4, 4], Q[5, 5] = bias_noise * dt, scale_noise * dt, gyro_scale_noise * dt
+    congruence(G, Q, noise)
+    congruence(F, P, grown)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            grown[i, j] += noise[i, j]
 
 
 def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from copy import copy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem
 
 from systems.io.bag import BagWriter
 from systems.io.ros_messages import Encoder, encoder
+from systems.io.ros_types import typestore
 from systems.validation import require, require_non_negative, require_positive
 
 _log = logging.getLogger(__name__)
@@ -68,6 +71,14 @@ class Channel:
     def is_vector(self) -> bool:
         """Whether the port carries a vector."""
         return isinstance(self.model, int)
+
+
+def _make_serialiser(channel: Channel, encode: Encoder) -> None:
+    """Lets rosbags compile what a type needs now, not when its first message comes."""
+    value = np.zeros(channel.model) if channel.is_vector else copy(channel.model)
+    with suppress(Exception):  # what says nothing yet may have no message; nothing is written
+        message = encode(value, 0.0)
+        typestore().serialize_cdr(message, message.__msgtype__)
 
 
 class Recorder(LeafSystem):
@@ -139,6 +150,7 @@ class Recorder(LeafSystem):
             )
             encode = encoder(channel.encode) if isinstance(channel.encode, str) else channel.encode
             groups.setdefault(channel.rate, []).append((channel, port, encode))
+            _make_serialiser(channel, encode)
         self.DeclareInitializationPublishEvent(self._record_static)
         for rate, group in groups.items():
             self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, partial(self._record, group))

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+
+from systems.compiled import compiled, in_rows
 
 Array = NDArray[np.float64]
 
@@ -15,12 +19,29 @@ def narrow_side(corners: Array) -> Array:
     best. A square seen straight on has its side; one that is tilted has its side times the cosine
     of the tilt, whichever way it is turned. Detectors fail by this number.
     """
-    a, b, c, d = (corners[:, i] for i in range(4))
-    right, down = (b - a + c - d) / 2, (d - a + c - b) / 2
-    squares = (right * right + down * down).sum(axis=1) / 2
-    difference = (right * right - down * down).sum(axis=1) / 2
-    product = (right * down).sum(axis=1)
-    return np.asarray(np.sqrt(np.maximum(squares - np.hypot(difference, product), 0.0)))
+    corners = in_rows(corners, 4, 2)
+    sides = np.empty(len(corners))
+    _narrow_sides(corners, sides)
+    return sides
+
+
+@compiled("void(f8[:,:,::1], f8[::1])")
+def _narrow_sides(corners: Array, sides: Array) -> None:
+    for k in range(len(corners)):
+        sides[k] = narrow_side_of(corners[k])
+
+
+@compiled()
+def narrow_side_of(corners: Array) -> float:
+    """Returns the narrow side of one quadrilateral (4, 2); for compiled code."""
+    squares, difference, product = 0.0, 0.0, 0.0
+    for i in range(2):
+        a, b, c, d = corners[0, i], corners[1, i], corners[2, i], corners[3, i]
+        right, down = (b - a + c - d) / 2, (d - a + c - b) / 2
+        squares += (right * right + down * down) / 2
+        difference += (right * right - down * down) / 2
+        product += right * down
+    return math.sqrt(max(squares - math.hypot(difference, product), 0.0))
 
 
 def corner_deviation(corners: Array, pixel_noise: float, pixel_noise_by_side: float) -> Array:

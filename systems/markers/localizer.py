@@ -11,13 +11,20 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.cameras import PinholeCamera
+from systems.compiled import compiled
 from systems.health import Counts
 from systems.markers.corner_noise import corner_deviation
 from systems.markers.layout import MarkerMap
 from systems.markers.planar_pose import SAME_POSE, angle_between, closed_form, planar_poses
-from systems.markers.pnp import PnpSolution, covariance, cross_matrix, refine, squared_errors
+from systems.markers.pnp import (
+    PnpSolution,
+    covariance,
+    refine,
+    squared_errors_by_object,
+)
 from systems.memo import Memo
 from systems.messages import Detections, PoseEstimate
+from systems.small_matrices import congruence, multiply
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -115,7 +122,7 @@ class _View:
 
     def errors_by_marker(self, R: Array, p: Array) -> Array:
         """Returns (b, n) root mean square errors of each marker under each of b poses, px."""
-        errors = squared_errors(R[:, None], p[:, None], self.points, self.rays, self.by_ray)
+        errors = squared_errors_by_object(R, p, self.points, self.rays, self.by_ray)
         return np.sqrt(errors / 4) * self.deviation
 
     def agree(self, solution: PnpSolution, limit: float) -> NDArray[np.bool_]:
@@ -152,6 +159,8 @@ class MapLocalizer:
         self._index = {marker.id: k for k, marker in enumerate(marker_map)}
         self._sizes = np.array([marker.size for marker in marker_map])
         self._corners = marker_map.corners(np.array(list(self._index)))
+        X_CB = X_BC.inverse()
+        self._X_CB = X_CB.rotation().matrix().copy(order="C"), X_CB.translation().copy()
         poses = [marker.X_WM for marker in marker_map]
         self._R_MW = np.array([X.rotation().matrix().T for X in poses]).reshape(-1, 3, 3)
         self._p_WM = np.array([X.translation() for X in poses]).reshape(-1, 3)
@@ -284,24 +293,15 @@ class MapLocalizer:
         ambiguous: bool,
         markers: int,
     ) -> PoseEstimate:
-        R_CW, p_CW = solutions.R[k], solutions.p[k]
-        X_CW = RigidTransform(RotationMatrix(_orthonormal(R_CW)), p_CW)
-        X_WB = X_CW.inverse().multiply(self.X_BC.inverse())
-        cov_C = covariance(solutions.information[k], 1.0)
-        # (delta, tau) of X_CW in C  ->  (delta', d) of X_WB in W.
-        R_WC = R_CW.T
-        p_CB_W = R_WC @ self.X_BC.inverse().translation()
-        G = np.zeros((6, 6))
-        G[:3, :3] = -R_WC
-        G[3:, 3:] = -R_WC
-        G[3:, :3] = -R_WC @ cross_matrix(p_CW) + cross_matrix(p_CB_W) @ R_WC
-        cov = G @ cov_C @ G.T
+        cov_C = covariance(solutions.information[k : k + 1], 1.0)[0]
+        R_WB, p_WB, cov = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
+        _pose_of_body(solutions.R[k], solutions.p[k], cov_C, *self._X_CB, R_WB, p_WB, cov)
         return PoseEstimate(
             stamp=stamp,
             frame_id=self.marker_map.frame,
             child_frame_id=self.body_frame,
-            pose=X_WB,
-            covariance=(cov + cov.T) / 2,
+            pose=RigidTransform(RotationMatrix(R_WB), p_WB),
+            covariance=cov,
             reprojection_rms=float(rms),
             ambiguous=ambiguous,
             markers=markers,
@@ -345,9 +345,36 @@ def _areas(corners: Array) -> Array:
     return np.asarray(np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]) / 2)
 
 
-def _orthonormal(R: Array) -> Array:
-    """Returns the rotation next to a product of many rotations, which rounding has bent."""
-    return 1.5 * R - 0.5 * R @ (R.T @ R)  # a Newton step toward the polar factor
+@compiled("void(f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,::1])")
+def _pose_of_body(
+    R_CW: Array,
+    p_CW: Array,
+    covariance: Array,
+    R_CB: Array,
+    p_CB: Array,
+    R_WB: Array,
+    p_WB: Array,
+    carried: Array,
+) -> None:
+    """Writes X_WB and its covariance, given X_CW and that of (delta, tau) of X_CW in C."""
+    # A Newton step toward the rotation next to a product of many, which rounding has bent.
+    square, R_WC = np.empty((3, 3)), np.empty((3, 3))
+    multiply(R_CW.T, R_CW, square)
+    multiply(R_CW, square, R_WB)
+    for i in range(3):
+        for j in range(3):
+            R_WC[j, i] = 1.5 * R_CW[i, j] - 0.5 * R_WB[i, j]
+    multiply(R_WC, R_CB, R_WB)
+    x, y, z = p_CB[0] - p_CW[0], p_CB[1] - p_CW[1], p_CB[2] - p_CW[2]
+    # The body turns by -R_WC delta, about C; and moves by -R_WC (tau - (p_CB - p_CW) x delta).
+    G = np.zeros((6, 6))
+    for i in range(3):
+        a, b, c = R_WC[i, 0], R_WC[i, 1], R_WC[i, 2]
+        p_WB[i] = a * x + b * y + c * z
+        G[i, 0], G[i, 1], G[i, 2] = -a, -b, -c
+        G[3 + i, 3], G[3 + i, 4], G[3 + i, 5] = -a, -b, -c
+        G[3 + i, 0], G[3 + i, 1], G[3 + i, 2] = b * z - c * y, c * x - a * z, a * y - b * x
+    congruence(G, covariance, carried)
 
 
 class Localizer(LeafSystem):

@@ -8,18 +8,20 @@ local minimum of the reprojection error (`systems.markers.pnp`).
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.compiled import compiled, in_rows
 from systems.markers.layout import marker_corners
 from systems.markers.pnp import PnpSolution, refine, rotation_from_vector
+from systems.small_matrices import solve_positive
 
 Array = NDArray[np.float64]
 
 SAME_POSE = 0.02  # rad; minima nearer to each other than this are one
-_NEXT, _AFTER = [1, 2, 0], [2, 0, 1]  # the other two axes of each, in cyclic order
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,76 +61,97 @@ def homography_of_square(corners: Array) -> Array:
     Returns:
         (n, 3, 3), lower right entry 1; not finite when three corners lie on a line.
     """
-    # Heckbert's mapping of the square (0, 0), (1, 0), (1, 1), (0, 1), then a change of variables.
-    c0, c1, c2, c3 = (corners[:, i] for i in (3, 2, 1, 0))
-    d1, d2 = c1 - c2, c3 - c2
-    s = c0 - c1 + c2 - c3
-    determinant = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    g = (s[:, 0] * d2[:, 1] - s[:, 1] * d2[:, 0]) / determinant
-    h = (d1[:, 0] * s[:, 1] - d1[:, 1] * s[:, 0]) / determinant
     H = np.empty((len(corners), 3, 3))
-    H[:, :2, 0] = c1 - c0 + g[:, None] * c1
-    H[:, :2, 1] = c3 - c0 + h[:, None] * c3
-    H[:, :2, 2] = c0
-    H[:, 2, 0], H[:, 2, 1], H[:, 2, 2] = g, h, 1.0
+    for quadrangle, homography in zip(in_rows(corners, 4, 2), H, strict=True):
+        _homography(quadrangle, homography)
+    return H
+
+
+@compiled("void(f8[:,::1], f8[:,::1])")
+def _homography(corners: Array, H: Array) -> None:
+    # Heckbert's mapping of the square (0, 0), (1, 0), (1, 1), (0, 1), then a change of variables.
+    d1x, d1y = corners[2, 0] - corners[1, 0], corners[2, 1] - corners[1, 1]
+    d2x, d2y = corners[0, 0] - corners[1, 0], corners[0, 1] - corners[1, 1]
+    sx = corners[3, 0] - corners[2, 0] + corners[1, 0] - corners[0, 0]
+    sy = corners[3, 1] - corners[2, 1] + corners[1, 1] - corners[0, 1]
+    determinant = d1x * d2y - d1y * d2x
+    g, h = (sx * d2y - sy * d2x) / determinant, (d1x * sy - d1y * sx) / determinant
     # (u, v) in [-1, 1] -> ((u + 1) / 2, (v + 1) / 2)
-    H = H @ np.array([[0.5, 0.0, 0.5], [0.0, 0.5, 0.5], [0.0, 0.0, 1.0]])
-    return H / H[:, 2:, 2:]
+    scale = g / 2 + h / 2 + 1
+    H[2, 0], H[2, 1], H[2, 2] = g / 2 / scale, h / 2 / scale, 1.0
+    for i in range(2):
+        u = (corners[2, i] - corners[3, i] + g * corners[2, i]) / 2
+        v = (corners[0, i] - corners[3, i] + h * corners[0, i]) / 2
+        H[i, 0], H[i, 1], H[i, 2] = u / scale, v / scale, (u + v + corners[3, i]) / scale
 
 
-def _two_rotations(H: Array) -> Array:
-    """Returns the two rotations (n, 2, 3, 3) of planes with homographies (n, 3, 3).
+@compiled()
+def _two_rotations(H: Array, R: Array) -> None:
+    """Writes the two rotations (2, 3, 3) of the plane with homography H (3, 3).
 
-    Columns: the plane's first axis, its second axis, its normal.
+    Columns: the plane's normal, its first axis, its second axis: x, y and z of a marker.
     """
-    centre = H[:, :2, 2]
-    J = H[:, :2, :2] - centre[:, :, None] * H[:, 2:, :2]
+    cx, cy = H[0, 2], H[1, 2]  # the centre
     # Rv turns the optical axis to the direction of the centre.
-    direction = np.concatenate([centre, np.ones((len(H), 1))], axis=1)
-    direction /= np.sqrt((direction * direction).sum(axis=1, keepdims=True))
-    x, y, z = direction.T
-    Rv = np.empty((len(H), 3, 3))
-    Rv[:, 0, 0] = 1 - x * x / (1 + z)
-    Rv[:, 0, 1] = Rv[:, 1, 0] = -x * y / (1 + z)
-    Rv[:, 1, 1] = 1 - y * y / (1 + z)
-    Rv[:, :, 2] = direction
-    Rv[:, 2, 0], Rv[:, 2, 1] = -x, -y
-    B = Rv[:, :2, :2] - centre[:, :, None] * Rv[:, 2:, :2]
-    A = np.linalg.solve(B, J)
+    length = math.sqrt(cx * cx + cy * cy + 1)
+    x, y, z = cx / length, cy / length, 1 / length
+    Rv00, Rv01, Rv11 = 1 - x * x / (1 + z), -x * y / (1 + z), 1 - y * y / (1 + z)
+    # A = B^-1 J of the 2 x 2 matrices J = H - centre H_3, B = Rv - centre Rv_3.
+    J00, J01 = H[0, 0] - cx * H[2, 0], H[0, 1] - cx * H[2, 1]
+    J10, J11 = H[1, 0] - cy * H[2, 0], H[1, 1] - cy * H[2, 1]
+    B00, B01, B10, B11 = Rv00 + cx * x, Rv01 + cx * y, Rv01 + cy * x, Rv11 + cy * y
+    determinant = B00 * B11 - B01 * B10
+    A00, A01 = (B11 * J00 - B01 * J10) / determinant, (B11 * J01 - B01 * J11) / determinant
+    A10, A11 = (B00 * J10 - B10 * J00) / determinant, (B00 * J11 - B10 * J01) / determinant
     # The largest singular value of A is the inverse distance.
-    AAt = A @ A.swapaxes(1, 2)
-    a, b, c = AAt[:, 0, 0], AAt[:, 1, 1], AAt[:, 0, 1]
-    scale = np.sqrt((a + b + np.sqrt((a - b) ** 2 + 4 * c * c)) / 2)
-    top = A / scale[:, None, None]
-    rest = np.maximum(1 - (top * top).sum(axis=1), 0.0)  # squares of the missing third row
-    product = -(top[:, :, 0] * top[:, :, 1]).sum(axis=1)
-    first, second = np.sqrt(rest).T
-    second = np.where(product < 0, -second, second)
-    columns = np.empty((len(H), 2, 3, 3))
-    columns[:, :, :2, :2] = top[:, None]
-    columns[:, 0, 2, 0], columns[:, 0, 2, 1] = first, second
-    columns[:, 1, 2, :2] = -columns[:, 0, 2, :2]
-    # Gram and Schmidt: rounding has left the columns not quite orthonormal.
-    e1, e2, e3 = (columns[..., i] for i in range(3))
-    e1 /= np.sqrt((e1 * e1).sum(axis=-1, keepdims=True))
-    e2 -= (e2 * e1).sum(axis=-1, keepdims=True) * e1
-    e2 /= np.sqrt((e2 * e2).sum(axis=-1, keepdims=True))
-    e3[...] = e1[..., _NEXT] * e2[..., _AFTER] - e1[..., _AFTER] * e2[..., _NEXT]  # e1 x e2
-    return Rv[:, None] @ columns
+    a, b, c = A00 * A00 + A01 * A01, A10 * A10 + A11 * A11, A00 * A10 + A01 * A11
+    scale = math.sqrt((a + b + math.sqrt((a - b) ** 2 + 4 * c * c)) / 2)
+    A00, A01, A10, A11 = A00 / scale, A01 / scale, A10 / scale, A11 / scale
+    # The missing third row, but for its sign.
+    first = math.sqrt(max(1 - A00 * A00 - A10 * A10, 0.0))
+    second = math.sqrt(max(1 - A01 * A01 - A11 * A11, 0.0))
+    if A00 * A01 + A10 * A11 > 0:
+        second = -second
+    for k in range(2):
+        # Gram and Schmidt: rounding has left the columns not quite orthonormal.
+        ux, uy, uz = A00, A10, first
+        vx, vy, vz = A01, A11, second
+        norm = math.sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux / norm, uy / norm, uz / norm
+        along = ux * vx + uy * vy + uz * vz
+        vx, vy, vz = vx - along * ux, vy - along * uy, vz - along * uz
+        norm = math.sqrt(vx * vx + vy * vy + vz * vz)
+        vx, vy, vz = vx / norm, vy / norm, vz / norm
+        wx, wy, wz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+        for j, (ex, ey, ez) in enumerate(((wx, wy, wz), (ux, uy, uz), (vx, vy, vz))):
+            R[k, 0, j] = Rv00 * ex + Rv01 * ey + x * ez
+            R[k, 1, j] = Rv01 * ex + Rv11 * ey + y * ez
+            R[k, 2, j] = -x * ex - y * ey + z * ez
+        first, second = -first, -second
 
 
-def _translations(R: Array, points: Array, rays: Array) -> Array:
-    """Returns the positions (b, 3) that fit rays (b, m, 2) best, linearly, for given rotations."""
-    arm = points @ R.swapaxes(-1, -2)
+@compiled("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1])")
+def _translation(R: Array, points: Array, rays: Array, p: Array) -> None:
+    """Writes the position (3,) that fits rays (m, 2) best, linearly, for a given rotation."""
     # x (arm_z + p_z) = arm_x + p_x, and the same in y: two rows [1 0 -x], [0 1 -y] a point.
-    m = rays.shape[1]
-    right = arm[..., 2:] * rays - arm[..., :2]
-    N = np.zeros((len(R), 3, 3))
-    N[:, 0, 0] = N[:, 1, 1] = m
-    N[:, :2, 2] = N[:, 2, :2] = -rays.sum(axis=1)
-    N[:, 2, 2] = (rays * rays).sum(axis=(1, 2))
-    v = np.concatenate([right.sum(axis=1), -(rays * right).sum(axis=(1, 2))[:, None]], axis=1)
-    return np.linalg.solve(N, v[..., None])[..., 0]
+    N = np.zeros((3, 3))
+    p[0], p[1], p[2] = 0.0, 0.0, 0.0
+    for k in range(len(points)):
+        x, y = rays[k, 0], rays[k, 1]
+        a, b, c = points[k, 0], points[k, 1], points[k, 2]
+        arm_z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        right_x = arm_z * x - (R[0, 0] * a + R[0, 1] * b + R[0, 2] * c)
+        right_y = arm_z * y - (R[1, 0] * a + R[1, 1] * b + R[1, 2] * c)
+        p[0] += right_x
+        p[1] += right_y
+        p[2] -= x * right_x + y * right_y
+        N[0, 0] += 1.0
+        N[1, 1] += 1.0
+        N[2, 0] -= x
+        N[2, 1] -= y
+        N[2, 2] += x * x + y * y
+    if not solve_positive(N, p):
+        p[0], p[1], p[2] = 0.0, 0.0, 0.0
 
 
 def planar_poses(rays: Array, by_ray: Array, sizes: Array) -> PlanarPoses:
@@ -164,7 +187,10 @@ def planar_poses(rays: Array, by_ray: Array, sizes: Array) -> PlanarPoses:
         p_first = p[merged, 0]
         mirror = mirrored(R[merged, 0], -p_first / np.linalg.norm(p_first, axis=1, keepdims=True))
         seen = points[merged], rays[merged], by_ray[merged]
-        image = refine(mirror, _translations(mirror, *seen[:2]), *seen, iterations=0)
+        p_mirror = np.empty((len(mirror), 3))
+        for k in range(len(mirror)):
+            _translation(mirror[k], seen[0][k], seen[1][k], p_mirror[k])
+        image = refine(mirror, p_mirror, *seen, iterations=0)
         R[merged, 1], p[merged, 1] = image.R, image.p
         error[merged, 1], information[merged, 1] = image.squared_error, image.information
     poses.R[good], poses.p[good] = R, p
@@ -184,18 +210,43 @@ def closed_form(rays: Array, sizes: Array) -> tuple[NDArray[np.bool_], Array, Ar
         (n,) which markers have poses at all, and for those m: (m, 2, 3, 3) `R_CM` and (m, 2, 3)
         `p_CM`, m.
     """
-    with np.errstate(all="ignore"):
-        H = homography_of_square(rays)
-        good = np.asarray(np.isfinite(H).all(axis=(1, 2)))
-        good &= (_twice_signed_areas(rays) > 0).all(axis=1)
-    if not good.any():
-        return good, np.zeros((0, 2, 3, 3)), np.zeros((0, 2, 3))
-    # The homography's plane has axes (right, up); a marker's are y and z, its normal is x.
-    R = _two_rotations(H[good])[..., [2, 0, 1]]
-    p = _translations(
-        R.reshape(-1, 3, 3), _points(sizes[good]).repeat(2, axis=0), rays[good].repeat(2, axis=0)
-    )
-    return good, R, p.reshape(-1, 2, 3)
+    n = len(rays)
+    good, R, p = np.empty(n, bool), np.empty((n, 2, 3, 3)), np.empty((n, 2, 3))
+    _closed_form(in_rows(rays, 4, 2), in_rows(_points(sizes), 4, 3), good, R, p)
+    return (good, R, p) if good.all() else (good, R[good], p[good])
+
+
+@compiled("void(f8[:,:,::1], f8[:,:,::1], b1[::1], f8[:,:,:,::1], f8[:,:,::1])")
+def _closed_form(rays: Array, points: Array, good: NDArray[np.bool_], R: Array, p: Array) -> None:
+    H = np.empty((3, 3))
+    for n in range(len(rays)):
+        corners = rays[n]
+        good[n] = _faces_us(corners)
+        if not good[n]:
+            continue
+        _homography(corners, H)
+        for i in range(3):
+            for j in range(3):
+                good[n] &= math.isfinite(H[i, j])
+        if good[n]:
+            _two_rotations(H, R[n])
+            for k in range(2):
+                _translation(R[n, k], points[n], corners, p[n, k])
+
+
+@compiled()
+def _faces_us(corners: Array) -> bool:
+    """Whether corners (4, 2) are those of a convex marker seen from the front.
+
+    Then they go clockwise in the picture, where y points down.
+    """
+    for i in range(4):
+        j, k = (i + 1) % 4, (i + 3) % 4
+        ahead_x, ahead_y = corners[j, 0] - corners[i, 0], corners[j, 1] - corners[i, 1]
+        behind_x, behind_y = corners[k, 0] - corners[i, 0], corners[k, 1] - corners[i, 1]
+        if not ahead_x * behind_y - ahead_y * behind_x > 0:
+            return False
+    return True
 
 
 def _points(sizes: Array) -> Array:
@@ -235,14 +286,3 @@ def _better_first(solution: PnpSolution) -> tuple[Array, Array, Array, Array]:
         error[rows, order],
         solution.information.reshape(-1, 2, 6, 6)[rows, order],
     )
-
-
-def _twice_signed_areas(corners: Array) -> Array:
-    """Returns (n, 4) the signed area at each corner.
-
-    All are positive for a convex marker seen from the front: clockwise in the picture, where y
-    points down.
-    """
-    ahead = corners[:, [1, 2, 3, 0]] - corners
-    behind = -ahead[:, [3, 0, 1, 2]]
-    return ahead[..., 0] * behind[..., 1] - ahead[..., 1] * behind[..., 0]

@@ -11,10 +11,14 @@ the error in pixels of the distorted picture: lens and calibration cost nothing 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from systems.compiled import compiled, in_rows
+from systems.small_matrices import solve_positive, turn
 
 Array = NDArray[np.float64]
 
@@ -79,6 +83,49 @@ def squared_errors(R: Array, p: Array, points: Array, rays: Array, by_ray: Array
     return error
 
 
+def squared_errors_by_object(
+    R: Array, p: Array, points: Array, rays: Array, by_ray: Array
+) -> Array:
+    """Returns what each of b poses leaves of each of n objects' points: (b, n), as above.
+
+    Args:
+        R: (b, 3, 3).
+        p: (b, 3).
+        points: (n, m, 3).
+        rays: (n, m, 2).
+        by_ray: (n, m, 2, 2).
+    """
+    m = points.shape[1]
+    errors = np.empty((len(R), len(points)))
+    _squared_errors(
+        in_rows(R, 3, 3), in_rows(p, 3), in_rows(points, m, 3), in_rows(rays, m, 2),
+        in_rows(by_ray, m, 2, 2), errors,
+    )  # fmt: skip
+    return errors
+
+
+@compiled("void(f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,::1])")
+def _squared_errors(
+    R: Array, p: Array, points: Array, rays: Array, by_ray: Array, errors: Array
+) -> None:
+    for i in range(len(R)):
+        for j in range(len(points)):
+            error = 0.0
+            for k in range(points.shape[1]):
+                a, b, c = points[j, k, 0], points[j, k, 1], points[j, k, 2]
+                x = R[i, 0, 0] * a + R[i, 0, 1] * b + R[i, 0, 2] * c + p[i, 0]
+                y = R[i, 1, 0] * a + R[i, 1, 1] * b + R[i, 1, 2] * c + p[i, 1]
+                z = R[i, 2, 0] * a + R[i, 2, 1] * b + R[i, 2, 2] * c + p[i, 2]
+                if not z >= _MIN_DEPTH:
+                    error = math.inf
+                    break
+                ex, ey = x / z - rays[j, k, 0], y / z - rays[j, k, 1]
+                for m in range(2):
+                    e = by_ray[j, k, m, 0] * ex + by_ray[j, k, m, 1] * ey
+                    error += e * e
+            errors[i, j] = error
+
+
 def _keep_before_camera(p_C: Array) -> NDArray[np.bool_]:
     """Returns which problems (...) have one of their points (..., m, 3) behind the camera.
 
@@ -90,28 +137,100 @@ def _keep_before_camera(p_C: Array) -> NDArray[np.bool_]:
     return behind
 
 
-def _normal_equations(R: Array, p: Array, points: Array, rays: Array, by_ray: Array) -> Array:
-    """Returns [J r]'[J r], (b, 7, 7), at the given poses: J'J, J'r and the squared error r'r.
+@compiled()
+def _normal_equations(
+    R: Array, p: Array, points: Array, rays: Array, by_ray: Array, product: Array
+) -> None:
+    """Writes [J r]'[J r], (7, 7), of one problem: J'J, J'r and the squared error r'r.
 
-    Of a problem with a point behind the camera the error is infinite.
+    With a point behind the camera the error is infinite and the rest zero.
     """
-    arm = points @ R.swapaxes(-1, -2)  # R p_F
-    p_C = arm + p[:, None, :]
-    behind = _keep_before_camera(p_C)
-    depth = p_C[..., 2:]
-    ray = p_C[..., :2] / depth
-    # Derivative of the ray (x/z, y/z) by position and, through p_C = w x arm + ..., by rotation.
-    by_position = np.empty((*ray.shape, 3))
-    by_position[..., :2] = by_ray
-    by_position[..., 2:] = by_ray @ -ray[..., None]
-    by_position /= depth[..., None]
-    rows = np.empty((*ray.shape, 7))
-    rows[..., :3] = by_position @ cross_matrix(-arm)
-    rows[..., 3:6] = by_position
-    rows[..., 6:] = by_ray @ (ray - rays)[..., None]
-    rows = rows.reshape(len(R), 2 * points.shape[-2], 7)
-    product = np.asarray(rows.swapaxes(-1, -2) @ rows)
-    product[behind, 6, 6] = np.inf
+    product[:] = 0.0
+    row = np.empty(7)
+    for k in range(len(points)):
+        a, b, c = points[k]
+        # R p_F, then the point in C.
+        arm_x = R[0, 0] * a + R[0, 1] * b + R[0, 2] * c
+        arm_y = R[1, 0] * a + R[1, 1] * b + R[1, 2] * c
+        arm_z = R[2, 0] * a + R[2, 1] * b + R[2, 2] * c
+        depth = arm_z + p[2]
+        if not depth >= _MIN_DEPTH:
+            product[:] = 0.0
+            product[6, 6] = np.inf
+            return
+        x, y = (arm_x + p[0]) / depth, (arm_y + p[1]) / depth
+        for i in range(2):
+            # Derivative by position and, through p_C = w x arm + ..., by rotation.
+            by_x, by_y = by_ray[k, i, 0] / depth, by_ray[k, i, 1] / depth
+            by_z = -(by_x * x + by_y * y)
+            row[0] = arm_y * by_z - arm_z * by_y
+            row[1] = arm_z * by_x - arm_x * by_z
+            row[2] = arm_x * by_y - arm_y * by_x
+            row[3], row[4], row[5] = by_x, by_y, by_z
+            row[6] = by_ray[k, i, 0] * (x - rays[k, 0]) + by_ray[k, i, 1] * (y - rays[k, 1])
+            for m in range(7):
+                for n in range(m + 1):
+                    product[m, n] += row[m] * row[n]
+    for m in range(7):
+        for n in range(m):
+            product[n, m] = product[m, n]
+
+
+@compiled(
+    "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,:,::1], i8, f8, f8)"
+)
+def _minimise(
+    R: Array,
+    p: Array,
+    points: Array,
+    rays: Array,
+    by_ray: Array,
+    iterations: int,
+    tolerance: float,
+    hopeless: float,
+) -> Array:
+    """Moves R and p to the minima (see `refine`); returns [J r]'[J r] there, (b, 7, 7)."""
+    b, shared = len(R), len(points) == 1
+    product, trial = np.empty((b, 7, 7)), np.empty((7, 7))
+    for i in range(b):
+        k = 0 if shared else i
+        _normal_equations(R[i], p[i], points[k], rays[k], by_ray[k], product[i])
+    damping = np.full(b, _DAMPING_START)
+    active = np.isfinite(product[:, 6, 6])
+    damped, step = np.empty((6, 6)), np.empty(6)
+    R_new, p_new = np.empty((3, 3)), np.empty(3)
+    for _ in range(iterations):
+        if not active.any():
+            break
+        for i in range(b):
+            if not active[i]:
+                continue
+            k, here = 0 if shared else i, product[i]
+            damped[:] = here[:6, :6]
+            for m in range(6):
+                damped[m, m] *= 1 + damping[i]
+                step[m] = -here[m, 6]
+            if not solve_positive(damped, step):
+                damping[i] *= 10.0
+                active[i] = damping[i] < _DAMPING_END
+                continue
+            # What the step would gain is known beforehand: the last look is spared.
+            if not -np.sum(step * here[:6, 6]) >= tolerance * (1 + here[6, 6]):
+                active[i] = False
+                continue
+            turn(step, R[i], R_new)
+            p_new[:] = p[i] + step[3:]
+            _normal_equations(R_new, p_new, points[k], rays[k], by_ray[k], trial)
+            if trial[6, 6] <= here[6, 6]:
+                R[i], p[i], product[i] = R_new, p_new, trial
+                damping[i] *= 0.1
+            else:
+                damping[i] *= 10.0
+                active[i] = damping[i] < _DAMPING_END
+        best = int(np.argmin(product[:, 6, 6]))
+        if not active[best]:
+            for i in range(b):
+                active[i] &= product[i, 6, 6] <= product[best, 6, 6] + hopeless
     return product
 
 
@@ -145,34 +264,13 @@ def refine(
         The local minima. A problem whose start has a point behind the camera keeps its start and
         an infinite error.
     """
-    R, p = R.copy(), p.copy()
-    product = _normal_equations(R, p, points, rays, by_ray)
-    H, g, error = product[:, :6, :6], product[:, :6, 6:], product[:, 6, 6]  # views
-    damping = np.full(len(R), _DAMPING_START)
-    active = np.isfinite(error)
-    identity = np.eye(6)
-    for _ in range(iterations):
-        damped = H * (1 + damping[:, None, None] * identity)
-        if not active.all():
-            damped[~active] = identity
-        step = np.asarray(np.linalg.solve(damped, -g), np.float64)
-        # What the step would gain is known beforehand: the last look is spared.
-        active &= -(step * g).sum(axis=(1, 2)) >= tolerance * (1 + error)
-        if not active.any():
-            break
-        step = step[..., 0]
-        R_new = rotation_from_vector(step[:, :3]) @ R
-        p_new = p + step[:, 3:]
-        product_new = _normal_equations(R_new, p_new, points, rays, by_ray)
-        better = active & (product_new[:, 6, 6] <= error)
-        for old, new in ((R, R_new), (p, p_new), (product, product_new)):
-            old[better] = new[better]
-        damping *= np.where(better, 0.1, 10.0)
-        active &= damping < _DAMPING_END
-        best = int(np.argmin(error))
-        if not active[best]:
-            active &= error <= error[best] + hopeless
-    return PnpSolution(R, p, error, H)
+    m = points.shape[-2]
+    R, p = np.array(R, order="C"), np.array(p, order="C")
+    points, rays = in_rows(points, m, 3), in_rows(rays, m, 2)
+    product = _minimise(
+        R, p, points, rays, in_rows(by_ray, m, 2, 2), iterations, tolerance, hopeless
+    )
+    return PnpSolution(R, p, product[:, 6, 6], product[:, :6, :6])
 
 
 def covariance(information: Array, pixel_noise: float) -> Array:
@@ -181,6 +279,28 @@ def covariance(information: Array, pixel_noise: float) -> Array:
     The Cramer-Rao bound at the solution: sigma^2 (J'J)^-1. A direction that the corners do not
     determine gets a huge variance, never NaN.
     """
+    inverses = np.empty(information.shape)
+    if _inverses(in_rows(information, 6, 6), in_rows(inverses, 6, 6)):
+        return pixel_noise**2 * inverses
     values, vectors = np.linalg.eigh(information)
     values = np.maximum(values, 1e-9 * np.maximum(values[..., -1:], 1e-9))
     return pixel_noise**2 * (vectors / values[..., None, :]) @ vectors.swapaxes(-1, -2)
+
+
+@compiled("b1(f8[:,:,::1], f8[:,:,::1])")
+def _inverses(A: Array, inverses: Array) -> bool:
+    """Writes the inverses of positive (6, 6) matrices; False when one is hardly one."""
+    factor, column = np.empty((6, 6)), np.empty(6)
+    for i in range(len(A)):
+        for j in range(6):
+            factor[:] = A[i]
+            column[:] = 0.0
+            column[j] = 1.0
+            if not solve_positive(factor, column):
+                return False
+            for k in range(6):
+                # The square of a pivot is what its unknown has left, the others given.
+                if factor[k, k] ** 2 < 1e-6 * A[i, k, k]:
+                    return False
+                inverses[i, k, j] = column[k]
+    return True

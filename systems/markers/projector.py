@@ -20,11 +20,13 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, OutputPort
 
 from systems.cameras import PinholeCamera
-from systems.markers.corner_noise import corner_deviation, narrow_side
+from systems.compiled import compiled, in_rows, packed
+from systems.markers.corner_noise import corner_deviation, narrow_side_of
 from systems.markers.family import Family
 from systems.markers.layout import MarkerMap, marker_corners
 from systems.messages import Detections
 from systems.noise import NoiseStream
+from systems.plumb_bob import distort
 from systems.raycasting import Solids, SolidsMemo, frame_poses
 from systems.sensors.sampled import SampledSensor
 from systems.validation import require, require_non_negative, require_positive
@@ -35,8 +37,6 @@ Array = NDArray[np.float64]
 # part of the distance from the camera, whichever is more.
 _BOARD = 1e-3
 _BOARD_PART = 0.005
-# Weights of the corners in `narrow_side`.
-_TURN = np.array([-1 + 1j, 1 + 1j, 1 - 1j, -1 - 1j]) / 2
 # Corners, centre, and corners again, to become those of the white margin.
 _OUTLINE = np.concatenate([marker_corners(1.0), np.zeros((1, 3)), marker_corners(1.0)])
 
@@ -134,39 +134,108 @@ def visible_markers(
         parameters: limits.
         solids: what may stand before the markers.
     """
-    camera_pose = X_WC.GetAsMatrix34()
-    R_WC, p_WC = camera_pose[:, :3], camera_pose[:, 3]
-    line = p_WC - X_WM[:, :, 3]
-    distance = np.sqrt((line * line).sum(axis=1))
-    toward = (line * X_WM[:, :, 0]).sum(axis=1)
-    near = toward > distance * np.cos(parameters.max_incidence)
-    near &= distance <= parameters.max_range
-    index = np.flatnonzero(near)
-
+    n, p, pose = len(sizes), parameters, in_rows(X_WC.GetAsMatrix34(), 4)
     outline = _OUTLINE.copy()
-    outline[5:] *= 1 + 2 * parameters.white_margin / cells
-    p_MQ = outline * sizes[index, None, None]
-    p_WQ = p_MQ @ X_WM[index, :, :3].transpose(0, 2, 1) + X_WM[index, None, :, 3]
-    p_CQ = (p_WQ - p_WC) @ R_WC
-    keep = (p_CQ[:, :, 2] > 0).all(axis=1)
-    fold = camera.fold_radius
-    if np.isfinite(fold):
-        keep &= (np.hypot(p_CQ[:, :, 0], p_CQ[:, :, 1]) < fold * p_CQ[:, :, 2]).all(axis=1)
-    index, p_WQ, p_CQ = index[keep], p_WQ[keep], p_CQ[keep]
-
-    pixels = camera.project(p_CQ)
-    side = narrow_side(pixels[:, :4])
-    low = parameters.border_px - 0.5  # the picture's edge: pixels count from their centres
-    high = np.array([camera.width, camera.height]) - 1 - low
-    keep = ((pixels >= low) & (pixels <= high)).all(axis=(1, 2))
-    keep &= side >= parameters.min_side_px
+    outline[5:] *= 1 + 2 * p.white_margin / cells
+    keep, p_WQ, pixels = np.empty(n, bool), np.empty((n, 5, 3)), np.empty((n, 4, 2))
+    side, distance, cosine = np.empty(n), np.empty(n), np.empty(n)
+    limits = np.array(
+        (
+            camera.width, camera.height, camera.fold_radius, math.cos(p.max_incidence),
+            p.max_range, p.min_side_px, p.border_px,
+        )
+    )  # fmt: skip
+    _outlines(
+        pose, in_rows(X_WM, 3, 4), packed(sizes), outline, *camera.matrices, limits,
+        keep, p_WQ, pixels, side, distance, cosine,
+    )  # fmt: skip
     if solids is not None and keep.any():
-        tolerance = np.maximum(_BOARD, _BOARD_PART * distance[index[keep]])
-        hidden = solids.occluded(p_WC, p_WQ[keep, :5].reshape(-1, 3), np.repeat(tolerance, 5))
+        tolerance = np.maximum(_BOARD, _BOARD_PART * distance[keep])
+        hidden = solids.occluded(pose[:, 3], p_WQ[keep].reshape(-1, 3), np.repeat(tolerance, 5))
         keep[keep] = ~hidden.reshape(-1, 5).any(axis=1)
-    index = index[keep]
-    incidence = np.arccos(np.minimum(toward[index] / distance[index], 1.0))
-    return VisibleMarkers(index, pixels[keep, :4], side[keep], incidence)
+    return VisibleMarkers(np.flatnonzero(keep), pixels[keep], side[keep], np.arccos(cosine[keep]))
+
+
+@compiled(
+    "void(f8[:,::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
+    " b1[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1])"
+)
+def _outlines(
+    X_WC: Array,
+    X_WM: Array,
+    sizes: Array,
+    outline: Array,
+    K: Array,
+    D: Array,
+    limits: Array,
+    keep: NDArray[np.bool_],
+    p_WQ: Array,
+    pixels: Array,
+    side: Array,
+    distance: Array,
+    cosine: Array,
+) -> None:
+    """Projects the markers that are in the picture if nothing hides them.
+
+    Args:
+        X_WC: (3, 4).
+        X_WM: (n, 3, 4).
+        sizes: (n,) m.
+        outline: (9, 3) corners, centre, corners of the margin; of a marker of size 1.
+        K: (3, 3) px.
+        D: (5,).
+        limits: width (px), height (px), radius of the distortion's fold, cosine of the incidence,
+            range (m), narrow side (px), border (px).
+        keep: (n,) written: which are; the rest is written for these.
+        p_WQ: (n, 5, 3) written: corners and centre, m.
+        pixels: (n, 4, 2) written: corners, px.
+        side: (n,) written: narrow side, px.
+        distance: (n,) written, m.
+        cosine: (n,) written: of the incidence.
+    """
+    width, height, fold, least_cosine = limits[0], limits[1], limits[2], limits[3]
+    max_range, min_side, border = limits[4], limits[5], limits[6]
+    low = border - 0.5  # the picture's edge: pixels count from their centres
+    from_camera, p_W = np.empty(3), np.empty(3)
+    for n in range(len(sizes)):
+        keep[n] = False
+        toward, square = 0.0, 0.0
+        for i in range(3):
+            line = X_WC[i, 3] - X_WM[n, i, 3]
+            toward += line * X_WM[n, i, 0]
+            square += line * line
+        far = math.sqrt(square)
+        if not (toward > far * least_cosine and far <= max_range):
+            continue
+        inside = True
+        for q in range(len(outline)):
+            for i in range(3):
+                p_W[i] = X_WM[n, i, 3]
+                for j in range(3):
+                    p_W[i] += X_WM[n, i, j] * outline[q, j] * sizes[n]
+                from_camera[i] = p_W[i] - X_WC[i, 3]
+            x, y, z = 0.0, 0.0, 0.0
+            for i in range(3):
+                x += X_WC[i, 0] * from_camera[i]
+                y += X_WC[i, 1] * from_camera[i]
+                z += X_WC[i, 2] * from_camera[i]
+            if not (z > 0 and math.hypot(x, y) < fold * z):
+                inside = False
+                break
+            bent_x, bent_y, _, _, _ = distort(x / z, y / z, D)
+            u, v = K[0, 0] * bent_x + K[0, 2], K[1, 1] * bent_y + K[1, 2]
+            if u < low or v < low or u > width - 1 - low or v > height - 1 - low:
+                inside = False
+                break
+            if q < 5:
+                p_WQ[n, q, 0], p_WQ[n, q, 1], p_WQ[n, q, 2] = p_W[0], p_W[1], p_W[2]
+            if q < 4:
+                pixels[n, q, 0], pixels[n, q, 1] = u, v
+        if not inside:
+            continue
+        side[n] = narrow_side_of(pixels[n])
+        distance[n], cosine[n] = far, min(toward / far, 1.0)
+        keep[n] = side[n] >= min_side
 
 
 def project_markers(

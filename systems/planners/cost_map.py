@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.compiled import compiled
 from systems.messages import OccupancyGrid
 from systems.planners.polyline import length_of, points_along
 
@@ -110,10 +111,31 @@ def cost_map(
         clearance = (distance - 0.5).astype(float) * resolution
     else:
         clearance = np.full(log_odds.shape, np.inf)
-    share = np.clip(1 - (clearance - radius) / max(soft_margin, 1e-9), 0, 1)
-    cost = 1 + soft_cost * share**2 + unknown_cost * (log_odds == 0)
-    cost[clearance < radius] = np.inf
+    cost = np.empty(log_odds.shape)
+    _costs(log_odds, clearance, radius, max(soft_margin, 1e-9), soft_cost, unknown_cost, cost)
     return CostMap(resolution, grid.origin - before[::-1] * resolution, cost, clearance)
+
+
+@compiled("void(f4[:,::1], f8[:,::1], f8, f8, f8, f8, f8[:,::1])")
+def _costs(
+    log_odds: NDArray[np.float32],
+    clearance: Array,
+    radius: float,
+    soft_margin: float,
+    soft_cost: float,
+    unknown_cost: float,
+    cost: Array,
+) -> None:
+    rows, columns = cost.shape
+    for row in range(rows):
+        for column in range(columns):
+            beyond = clearance[row, column] - radius
+            if beyond < 0:
+                cost[row, column] = math.inf
+                continue
+            share = max(1 - beyond / soft_margin, 0.0)
+            unknown = unknown_cost if log_odds[row, column] == 0 else 0.0
+            cost[row, column] = 1 + soft_cost * share * share + unknown
 
 
 def way_out(costs: CostMap, cell: Cell, escape: float) -> list[Cell] | None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem, OutputPort, State
 
+from systems.compiled import compiled, packed
 from systems.health import Counts
 from systems.messages import OccupancyGrid, Scan
 from systems.pose_trail import empty_trail, poses_at, ray_poses, remember
@@ -181,29 +182,59 @@ def with_scan(
     corners = np.concatenate([ends, rays[:, :2]])
     grid = grown(grid, corners, growth=p.growth, max_side=p.max_side)
 
-    free_until = np.where(is_hit, ranges - grid.resolution / 2, ranges)
-    step = grid.resolution / 2
-    counts = np.floor(np.maximum(free_until, 0) / step).astype(np.intp)
-    along = (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)) * step
-    # In cells from the grid's corner, so that to truncate is to round down.
-    start = (rays[:, :2] - grid.origin) / grid.resolution
-    x, y = (
-        np.repeat(start[:, axis], counts)
-        + along * np.repeat(direction[:, axis] / grid.resolution, counts)
-        for axis in (0, 1)
-    )
-    hit = cells_of(ends[is_hit], grid)
-
-    change = np.zeros(grid.log_odds.shape, np.float32)
-    change[y.astype(np.intp), x.astype(np.intp)] = p.miss
-    change[hit[:, 0], hit[:, 1]] = p.hit
+    free = np.where(is_hit, ranges - grid.resolution / 2, ranges) / grid.resolution
+    # In cells from the grid's corner.
+    starts = (rays[:, :2] - grid.origin) / grid.resolution
+    stops = (ends - grid.origin) / grid.resolution
+    log_odds = np.array(grid.log_odds, np.float32, order="C")
+    limits = np.array((p.miss, p.hit, p.least, p.most))
+    _mark(packed(starts), packed(direction), packed(stops), free, is_hit, limits, log_odds)
     return OccupancyGrid(
         stamp=scan.stamp,
         frame_id=grid.frame_id,
         resolution=grid.resolution,
         origin=grid.origin,
-        log_odds=np.clip(grid.log_odds + change, p.least, p.most, dtype=np.float32),
+        log_odds=log_odds,
     )
+
+
+@compiled("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], b1[::1], f8[::1], f4[:,::1])")
+def _mark(
+    starts: Array,
+    directions: Array,
+    stops: Array,
+    free: Array,
+    is_hit: NDArray[np.bool_],
+    limits: Array,
+    log_odds: NDArray[np.float32],
+) -> None:
+    """Changes the log-odds by what n rays say.
+
+    Args:
+        starts: (n, 2) x, y in cells.
+        directions: (n, 2) of length 1.
+        stops: (n, 2) where the rays ended, in cells.
+        free: (n,) how far each ray was free, in cells; negative for nowhere.
+        is_hit: (n,) whether it hit something where it ended.
+        limits: miss, hit, least, most.
+        log_odds: changed.
+    """
+    miss, hit, least, most = limits[0], limits[1], limits[2], limits[3]
+    seen: NDArray[np.int8] = np.zeros(log_odds.shape, np.int8)  # 1 free, 2 hit
+    rows, columns = log_odds.shape
+    for k in range(len(starts)):
+        for n in range(int(max(free[k], 0.0) * 2)):  # looked at every half a cell
+            x = starts[k, 0] + n / 2 * directions[k, 0]
+            y = starts[k, 1] + n / 2 * directions[k, 1]
+            seen[int(y), int(x)] = 1
+    for k in range(len(starts)):
+        if is_hit[k]:
+            seen[math.floor(stops[k, 1]), math.floor(stops[k, 0])] = 2
+    for row in range(rows):
+        for column in range(columns):
+            if seen[row, column]:
+                changed = log_odds[row, column] + (miss if seen[row, column] == 1 else hit)
+                log_odds[row, column] = min(max(changed, least), most)
 
 
 def moved_too_fast(

@@ -11,6 +11,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
+from systems.compiled import compiled, packed
 from systems.noise import NoiseStream, sample_index
 from systems.validation import require, require_non_negative, require_positive
 
@@ -18,6 +19,7 @@ Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s^2, as Drake's UniformGravityFieldElement
 
+_NONE = np.zeros(0)
 _PIECE = 2**64  # of the noise stream: no sample has so high a number
 
 
@@ -209,18 +211,80 @@ def ideal_sample(X_WB: RigidTransform, V_WB: Array, A_WB: Array, p_BS: Array) ->
         (6,) angular velocity (rad/s) and specific force (m/s^2), in B; at rest the force is +g
         upward.
     """
-    in_W = np.array([V_WB[:3], A_WB[:3], A_WB[3:]])
-    in_W[2, 2] += GRAVITY
-    rate, turn, (fx, fy, fz) = (in_W @ X_WB.rotation().matrix()).tolist()
-    (wx, wy, wz), (ax, ay, az), (px, py, pz) = rate, turn, p_BS.tolist()
+    sample = np.empty(6)
+    R_WB = packed(X_WB.rotation().matrix())
+    _ideal_sample(R_WB, packed(V_WB), packed(A_WB), packed(p_BS), sample)
+    return sample
+
+
+@compiled("void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1])")
+def _ideal_sample(R: Array, V: Array, A: Array, p: Array, sample: Array) -> None:
+    for i in range(3):  # in B: angular velocity, specific force at B's origin
+        sample[i] = R[0, i] * V[0] + R[1, i] * V[1] + R[2, i] * V[2]
+        sample[3 + i] = R[0, i] * A[3] + R[1, i] * A[4] + R[2, i] * (A[5] + GRAVITY)
+    wx, wy, wz = sample[0], sample[1], sample[2]
+    ax = R[0, 0] * A[0] + R[1, 0] * A[1] + R[2, 0] * A[2]
+    ay = R[0, 1] * A[0] + R[1, 1] * A[1] + R[2, 1] * A[2]
+    az = R[0, 2] * A[0] + R[1, 2] * A[1] + R[2, 2] * A[2]
     # f + a x p + w x (w x p)
-    along, square = wx * px + wy * py + wz * pz, wx * wx + wy * wy + wz * wz
-    force = (
-        fx + ay * pz - az * py + wx * along - px * square,
-        fy + az * px - ax * pz + wy * along - py * square,
-        fz + ax * py - ay * px + wz * along - pz * square,
-    )
-    return np.array([*rate, *force])
+    along, square = wx * p[0] + wy * p[1] + wz * p[2], wx * wx + wy * wy + wz * wz
+    sample[3] += ay * p[2] - az * p[1] + wx * along - p[0] * square
+    sample[4] += az * p[0] - ax * p[2] + wy * along - p[1] * square
+    sample[5] += ax * p[1] - ay * p[0] + wz * along - p[2] * square
+
+
+@compiled(
+    "void(f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], c16, f8[::1], f8[::1],"
+    " f8[::1], f8[::1], f8[::1])"
+)
+def _add_errors(
+    sample: Array,
+    vibration: Array,
+    matrix: Array,
+    bias: Array,
+    drift: Array,
+    turn: complex,
+    shake_kick: Array,
+    forget: Array,
+    drift_kick: Array,
+    deviation: Array,
+    noise: Array,
+) -> None:
+    """Changes an ideal sample (6,) to one with errors, and vibration and drift to the next.
+
+    Args:
+        sample: changed.
+        vibration: (12,) six complex numbers, changed; of size 0 without vibration.
+        matrix: (6, 6) scale and cross-axis errors.
+        bias: (6,).
+        drift: (6,), changed; of size 0 without drift.
+        turn: what the vibration is multiplied with.
+        shake_kick: (6,) deviations of what is added to it.
+        forget: (6,) what the drift is multiplied with.
+        drift_kick: (6,) deviations of what is added to it.
+        deviation: (6,) of the white noise.
+        noise: (6, 12, 18 or 24) normal numbers: white, drift, vibration.
+    """
+    if len(vibration):
+        first = len(noise) - 12
+        for i in range(6):
+            re, im = vibration[2 * i], vibration[2 * i + 1]
+            sample[i] += re
+            vibration[2 * i] = (
+                turn.real * re - turn.imag * im + shake_kick[i] * noise[first + 2 * i]
+            )
+            vibration[2 * i + 1] = (
+                turn.real * im + turn.imag * re + shake_kick[i] * noise[first + 2 * i + 1]
+            )
+    true = sample.copy()
+    for i in range(6):
+        told = bias[i] + deviation[i] * noise[i]
+        for j in range(6):
+            told += matrix[i, j] * true[j]
+        if len(drift):
+            told += drift[i]
+            drift[i] = forget[i] * drift[i] + drift_kick[i] * noise[6 + i]
+        sample[i] = told
 
 
 class Imu(LeafSystem):
@@ -292,9 +356,6 @@ class Imu(LeafSystem):
         # What a sensor does not have costs nothing at each of its samples.
         self._drifts = bool(self._drift_deviation.any())
         self._vibrates = bool(shake.any())
-        self._distorts = max(p.gyro_scale_tolerance, p.accel_scale_tolerance) > 0 or (
-            p.cross_axis_tolerance > 0
-        )
         self._limited = bool(np.isfinite(self._limit).any())
         self._p_BS = np.zeros(3) if p_BS is None else np.array(p_BS, float)
         sound = self._p_BS.shape == (3,) and bool(np.isfinite(self._p_BS).all())
@@ -347,23 +408,25 @@ class Imu(LeafSystem):
             self._acceleration_input.Eval(context),
             self._p_BS,
         )
-        index = sample_index(context.get_time(), self._rate)
         size = 6 + 6 * self._drifts + 12 * self._vibrates
-        noise = self._noise.normals(context, index, size)
-        if self._vibrates:
-            vibration = context.get_discrete_state(self._vibration).get_value().view(complex)
-            sample = sample + vibration.real
-            vibration = self._turn * vibration + self._shake_kick * noise[-12:].view(complex)
-            discrete_state.set_value(self._vibration, vibration.view(float))
-        if self._distorts:
-            sample = context.get_discrete_state(self._matrix).get_value().reshape(6, 6) @ sample
-        sample = sample + context.get_discrete_state(self._bias).get_value()
-        sample += self._deviation * noise[:6]
-        if self._drifts:
-            drift = context.get_discrete_state(self._drift).get_value()
-            sample += drift
-            drift = self._forget * drift + self._kick * noise[6:12]
-            discrete_state.set_value(self._drift, drift)
+        noise = self._noise.normals(context, sample_index(context.get_time(), self._rate), size)
+        matrix = discrete_state.get_mutable_value(self._matrix).reshape(6, 6)
+        bias = discrete_state.get_mutable_value(self._bias)
+        vibration = discrete_state.get_mutable_value(self._vibration)
+        drift = discrete_state.get_mutable_value(self._drift)
+        _add_errors(
+            sample,
+            vibration if self._vibrates else _NONE,
+            matrix,
+            bias,
+            drift if self._drifts else _NONE,
+            self._turn,
+            self._shake_kick,
+            self._forget,
+            self._kick,
+            self._deviation,
+            packed(noise),
+        )
         if self._limited:
             sample = digital(sample, self._limit, self._parameters.bits)
         discrete_state.set_value(self._sample, sample)

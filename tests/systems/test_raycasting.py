@@ -29,7 +29,6 @@ from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, CoulombFriction
 from pydrake.multibody.tree import SpatialInertia, UnitInertia
 from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
-from systems import raycasting
 from systems.raycasting import Solids, SolidsMemo, solids_from_inspector
 
 MISS = np.inf
@@ -61,13 +60,6 @@ L_OBJ = "".join(
     "f 1 2 8 7\nf 2 3 9 8\nf 3 4 10 9\nf 4 5 11 10\nf 5 6 12 11\nf 6 1 7 12\n"
 )
 FLAT_OBJ = "v 0 -1 -1\nv 0 1 -1\nv 0 1 1\nv 0 -1 1\nf 1 2 3\nf 1 3 4\n"
-
-
-@pytest.fixture(params=["by spheres", "by azimuths"], autouse=True)
-def candidates(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All that is said here holds for both ways to find the solids that a ray may meet."""
-    few = 10**9 if request.param == "by spheres" else 0
-    monkeypatch.setattr(raycasting, "_FEW", few)
 
 
 def octahedron() -> Convex:
@@ -341,9 +333,7 @@ def fan(n: int) -> np.ndarray:
 
 @pytest.mark.parametrize("tilt", [0.0, 1e-4, 0.3, np.pi / 2])
 @pytest.mark.parametrize("spread", [0.0, 0.3])
-def test_a_fan_equals_its_rays_one_at_a_time(
-    tilt: float, spread: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_fan_equals_its_rays_one_at_a_time(tilt: float, spread: float, tmp_path: Path) -> None:
     rng = np.random.default_rng(6)
     shapes = [*random_shapes(rng, 60, tmp_path), HalfSpace()]
     poses = [random_pose(rng, 5.0) for _ in shapes[:-1]] + [RigidTransform([0.0, 0.0, -4.0])]
@@ -354,7 +344,6 @@ def test_a_fan_equals_its_rays_one_at_a_time(
         origins = origins[:1]
     solids = Solids(shapes, poses)
     together = solids.first_hit(origins, directions, 9.0)
-    monkeypatch.setattr(raycasting, "_FEW", 10**9)
     apart = [
         solids.first_hit(o, d[None], 9.0)[0]
         for o, d in zip(np.broadcast_to(origins, (200, 3)), directions, strict=True)

@@ -1,0 +1,101 @@
+"""Linear algebra of a few unknowns, compiled: for use within other compiled loops."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from systems.compiled import compiled
+
+Array = NDArray[np.float64]
+
+
+@compiled()
+def solve_positive(A: Array, b: Array) -> bool:
+    """Solves A x = b of a symmetric positive A in place: b becomes x, A its Cholesky factor.
+
+    Args:
+        A: (n, n); only its lower half is read.
+        b: (n,).
+
+    Returns:
+        False, with A and b spoilt, when A is not positive (or not finite).
+    """
+    n = len(b)
+    for j in range(n):
+        pivot = A[j, j]
+        for k in range(j):
+            pivot -= A[j, k] * A[j, k]
+        if not (pivot > 0.0 and pivot < math.inf):
+            return False
+        root = math.sqrt(pivot)
+        A[j, j] = root
+        for i in range(j + 1, n):
+            rest = A[i, j]
+            for k in range(j):
+                rest -= A[i, k] * A[j, k]
+            A[i, j] = rest / root
+    for i in range(n):
+        rest = b[i]
+        for k in range(i):
+            rest -= A[i, k] * b[k]
+        b[i] = rest / A[i, i]
+    for i in range(n - 1, -1, -1):
+        rest = b[i]
+        for k in range(i + 1, n):
+            rest -= A[k, i] * b[k]
+        b[i] = rest / A[i, i]
+    return True
+
+
+@compiled()
+def turn(w: Array, R: Array, turned: Array) -> None:
+    """Writes exp([w]x) R (Rodrigues).
+
+    Args:
+        w: rotation vector in its first three entries, rad.
+        R: (3, 3).
+        turned: (3, 3), written; not R itself.
+    """
+    x, y, z = w[0], w[1], w[2]
+    angle = math.sqrt(x * x + y * y + z * z)
+    half = angle / 2
+    sinc = math.sin(half) / half if half > 1e-9 else 1.0  # sin(h) / h
+    a, b = sinc * math.cos(half), sinc * sinc / 2
+    for j in range(3):
+        u, v, t = R[0, j], R[1, j], R[2, j]
+        # w x r, and w x (w x r)
+        cx, cy, cz = y * t - z * v, z * u - x * t, x * v - y * u
+        turned[0, j] = u + a * cx + b * (y * cz - z * cy)
+        turned[1, j] = v + a * cy + b * (z * cx - x * cz)
+        turned[2, j] = t + a * cz + b * (x * cy - y * cx)
+
+
+@compiled()
+def multiply(A: Array, B: Array, product: Array) -> None:
+    """Writes A B. NumPy's own product needs SciPy when compiled, and is slower for a few rows."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            total = 0.0
+            for k in range(A.shape[1]):
+                total += A[i, k] * B[k, j]
+            product[i, j] = total
+
+
+@compiled()
+def congruence(A: Array, P: Array, product: Array) -> None:
+    """Writes A P A', (n, n), of a symmetric P (m, m) and A (n, m); not into A or P."""
+    n, m = A.shape
+    row = np.empty(m)
+    for i in range(n):
+        for k in range(m):
+            row[k] = 0.0
+            for j in range(m):
+                row[k] += A[i, j] * P[j, k]
+        for j in range(i + 1):
+            total = 0.0
+            for k in range(m):
+                total += row[k] * A[j, k]
+            product[i, j] = product[j, i] = total
