@@ -23,6 +23,8 @@ from systems.validation import require
 
 Array = NDArray[np.float64]
 
+_RADTAN = ("radtan", "plumb_bob", "none")  # names of our distortion model in files of Kalibr's
+
 
 @dataclass(frozen=True, eq=False)
 class PinholeCamera:
@@ -202,14 +204,21 @@ class PinholeCamera:
 def load_camera(path: Path) -> PinholeCamera:
     """Reads a camera file.
 
-    Two forms are accepted: ours (`width`, `height`, `K`, `D`) and the one that ROS's camera
+    Three forms are accepted: ours (`width`, `height`, `K`, `D`), the one that ROS's camera
     calibration writes (`image_width`, `image_height`, `camera_matrix.data`,
-    `distortion_coefficients.data`, `distortion_model: plumb_bob`).
+    `distortion_coefficients.data`, `distortion_model: plumb_bob`), and the one of Kalibr and
+    TagSLAM (`cam0: {camera_model: pinhole, intrinsics, distortion_model: radtan,
+    distortion_coeffs, resolution}`). Of several cameras in such a file one is named behind a
+    colon: `cameras.yaml:cam1`.
 
     Raises:
         ValueError: the file is missing, no YAML, lacks a key, has an unknown one, or a value is
             out of range; the message names the file and the key.
     """
+    name = ""
+    if not path.exists() and ":" in path.name:
+        stem, _, name = path.name.rpartition(":")
+        path = path.with_name(stem)
     try:
         content = YAML(typ="safe", pure=True).load(path.read_text())
     except OSError as error:
@@ -218,9 +227,55 @@ def load_camera(path: Path) -> PinholeCamera:
         line = str(error).splitlines()[0]
         raise ValueError(f"camera file {path} is not YAML: {line}") from error
     try:
+        if _is_kalibr(content):
+            return _camera_from_kalibr(content, name)
+        require(not name, "camera", name, "left out: the file holds one, without a name")
         return camera_from_mapping(content)
     except ValueError as error:
         raise ValueError(f"camera file {path}: {error}") from error
+
+
+def _is_kalibr(content: Any) -> bool:
+    return isinstance(content, dict) and any(
+        isinstance(value, dict) and "camera_model" in value for value in content.values()
+    )
+
+
+def _camera_from_kalibr(content: dict[str, Any], name: str) -> PinholeCamera:
+    """Returns a camera of a file of Kalibr's.
+
+    Format: https://github.com/ethz-asl/kalibr/wiki/yaml-formats; TagSLAM's own is the same with
+    OpenCV's names of the models.
+    """
+    cameras = {k: v for k, v in content.items() if isinstance(v, dict) and "camera_model" in v}
+    names = ", ".join(map(str, cameras))
+    require(bool(name) or len(cameras) == 1, "cameras", names, "one: name it, as in FILE:cam0")
+    require(not name or name in cameras, "camera", name, f"one of {names}")
+    name, entry = (name, cameras[name]) if name else next(iter(cameras.items()))
+    for key in ("intrinsics", "resolution", "distortion_model", "distortion_coeffs"):
+        if key not in entry:
+            raise ValueError(f"{name} lacks the key {key!r}")
+    require(entry["camera_model"] == "pinhole", f"{name}.camera_model", entry["camera_model"],
+            "pinhole: no other is modelled")  # fmt: skip
+    model = entry["distortion_model"]
+    require(model in _RADTAN, f"{name}.distortion_model", model,
+            f"{', '.join(_RADTAN)}: no other is modelled")  # fmt: skip
+    numbers = {}
+    for key, count in (("intrinsics", 4), ("resolution", 2)):
+        value = entry[key]
+        sound = isinstance(value, list) and len(value) == count
+        require(sound, f"{name}.{key}", value, f"a list of {count} numbers")
+        numbers[key] = value
+    fx, fy, cx, cy = numbers["intrinsics"]
+    coefficients = [] if model == "none" else entry["distortion_coeffs"]
+    return camera_from_mapping(
+        {
+            "width": numbers["resolution"][0],
+            "height": numbers["resolution"][1],
+            "K": [fx, 0, cx, 0, fy, cy, 0, 0, 1],
+            "D": coefficients,
+        }
+    )
 
 
 def camera_from_mapping(content: Any) -> PinholeCamera:

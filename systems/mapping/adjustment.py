@@ -1,11 +1,11 @@
 """All tags and all camera poses together from all corners: bundle adjustment with square tags.
 
-The unknowns are `X_CW` of every frame's camera and `X_WT` of every tag but the anchor, whose pose
-is given and fixes the gauge. Residuals are those of the corners, in units of their noise, and,
-where there is odometry, of the motion from each frame to the next. Levenberg and Marquardt; in each
-step the cameras are eliminated (Schur complement): without odometry their matrix is block-diagonal,
-with it block-tridiagonal, and Cholesky's factors have the same shape. What is left is a dense
-system in the tags, of which there are few.
+The unknowns are `X_CW` of every frame's camera and `X_WT` of every tag but the anchor, or anchors,
+whose poses are given and fix the gauge. Residuals are those of the corners, in units of their
+noise, and, where there is odometry, of the motion from each frame to the next. Levenberg and
+Marquardt; in each step the cameras are eliminated (Schur complement): without odometry their matrix
+is block-diagonal, with it block-tridiagonal, and Cholesky's factors have the same shape. What is
+left is a dense system in the tags, of which there are few.
 
 Tangents: rotation first, a small rotation vector in the parent (C for cameras, W for tags), then
 the position in the parent. A sighting that fits badly counts less (Huber; of its 8 residuals
@@ -22,10 +22,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.mapping.scene import Motion, Scene, motion_residuals, residuals
+from systems.mapping.scene import Motion, Scene, corner_errors, motion_residuals, residuals
 from systems.mapping.sightings import Sightings
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 _DAMPING_START, _DAMPING_END = 1e-6, 1e8
 _LEAST = 1e-9  # information of what nothing is known of, 1/rad^2 and 1/m^2
@@ -46,8 +47,10 @@ class Adjustment:
         squared_motion: (n,) the same of the motions; empty without odometry.
         iterations: steps that were tried.
         converged: whether the last step promised next to nothing.
-        tag_covariance: (tags, 6, 6), zeros for the anchor; NaN for tags never seen.
-        camera_covariance: (frames, 6, 6) of `X_CW`; NaN for frames of which nothing is known.
+        tag_covariance: (tags, 6, 6), zeros for the anchor; NaN for tags never seen. Empty if they
+            were not asked for.
+        camera_covariance: (frames, 6, 6) of `X_CW`; NaN for frames of which nothing is known. Empty
+            if they were not asked for.
     """
 
     scene: Scene
@@ -63,7 +66,12 @@ class _System:
     """The normal equations of a step, and their solution with the cameras eliminated."""
 
     def __init__(
-        self, scene: Scene, sightings: Sightings, motion: Motion | None, anchor: int, huber: float
+        self,
+        scene: Scene,
+        sightings: Sightings,
+        motion: Motion | None,
+        anchor: int | Indices,
+        huber: float,
     ) -> None:
         s = sightings
         frames, tags = s.frames, s.tags
@@ -93,7 +101,7 @@ class _System:
             self.g_cameras[1:] += (there.swapaxes(1, 2) @ e[..., None])[..., 0]
             self.coupling = there.swapaxes(1, 2) @ here  # (n, 6, 6), row: the next camera
         self.free = np.flatnonzero(
-            (np.arange(tags) != anchor) & (np.bincount(s.tag, minlength=tags) > 0)
+            ~np.isin(np.arange(tags), anchor) & (np.bincount(s.tag, minlength=tags) > 0)
         )
         self.place = np.full(tags, -1)
         self.place[self.free] = np.arange(len(self.free))
@@ -239,19 +247,20 @@ def adjust(
     scene: Scene,
     sightings: Sightings,
     *,
-    anchor: int,
+    anchor: int | Indices,
     pixel_noise: float = 1.0,
     motion: Motion | None = None,
     huber: float = _HUBER,
     iterations: int = 50,
     tolerance: float = 1e-6,
+    covariances: bool = True,
 ) -> Adjustment:
     """Moves cameras and tags to where the corners, and the motion, say that they are.
 
     Args:
         scene: to start from.
         sightings: of tags in frames.
-        anchor: number of the tag that stays where `scene` has it.
+        anchor: number of the tag that stays where `scene` has it, or numbers of several.
         pixel_noise: standard deviation of a corner's coordinate, px.
         motion: odometry, if there is any.
         huber: a sighting whose 8 residuals are longer together than this, in units of their noise,
@@ -259,6 +268,7 @@ def adjust(
         iterations: steps that are tried at most.
         tolerance: a step that promises to lower the cost by less than this part of it, or by less
             than this, is the last.
+        covariances: whether to work them out.
 
     Returns:
         The best scene, with marginal covariances for the given noise.
@@ -278,7 +288,8 @@ def adjust(
             scene, system, damping = moved, trial, damping * 0.1
         else:
             damping *= 10.0
-    of_tags, of_cameras = system.covariances()
+    none = np.zeros((0, 6, 6))
+    of_tags, of_cameras = system.covariances() if covariances else (none, none)
     return Adjustment(
         scene, system.squared, system.squared_motion, tries, converged, of_tags, of_cameras
     )
@@ -289,7 +300,7 @@ def robust_cost(scene: Scene, sightings: Sightings, pixel_noise: float) -> Array
 
     What `adjust` minimises, tag by tag.
     """
-    r, _, _ = residuals(scene, sightings)
+    r = corner_errors(scene, sightings)
     squared = np.minimum((r * r).sum(axis=1) / pixel_noise**2, _HOPELESS)
     cost = np.bincount(sightings.tag, _huber(squared, _HUBER), minlength=sightings.tags)
     return np.asarray(cost, np.float64)

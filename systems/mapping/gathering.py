@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import bisect
+import math
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,9 +53,9 @@ def gather(
     """Makes sightings of detections.
 
     Args:
-        detections: in the order in which they were recorded. A stamp that does not lie after all
-            before it is a `bad_stamp`; of a tag that a frame shows twice none can be told to be the
-            real one (`repeated_id`).
+        detections: in the order in which they were recorded. Frames whose stamps do not ascend with
+            those of most others have a `bad_stamp`; of a tag that a frame shows twice none can be
+            told to be the real one (`repeated_id`).
         camera: that took the pictures.
         size: side of the black square of tags, m.
         sizes: of those by id that have another one.
@@ -71,12 +73,10 @@ def gather(
     ids: list[NDArray[np.int64]] = []
     corners: list[Array] = []
     require_positive(**{f"size of tag {i}": s for i, s in (sizes or {}).items()})
-    last = -np.inf
-    for found in detections:
-        if not (np.isfinite(found.stamp) and found.stamp > last):
-            dropped["bad_stamp"] += 1
-            continue
-        last = found.stamp
+    frames_found = list(detections)
+    ascending = _ascending([found.stamp for found in frames_found])
+    dropped["bad_stamp"] = len(frames_found) - len(ascending)
+    for found in (frames_found[k] for k in ascending):
         once = _once(found.ids)
         finite = np.asarray(np.isfinite(found.corners).all(axis=(1, 2)))
         large = _shortest_side(found.corners) >= min_side
@@ -111,6 +111,29 @@ def gather(
         len(frames),
     )
     return Gathered(sightings, known, np.array(stamps)[frames], dropped)
+
+
+def _ascending(stamps: Sequence[float]) -> list[int]:
+    """Returns the numbers of a longest ascending part of the stamps, the earliest of several.
+
+    So that one stamp far ahead costs a frame, not all that come after it.
+    """
+    # From the end: the largest stamp that a run of each length may begin with.
+    lengths = np.zeros(len(stamps), int)
+    begins: list[float] = []  # negative stamps, ascending
+    for k in range(len(stamps) - 1, -1, -1):
+        if not math.isfinite(stamps[k]):
+            continue
+        place = bisect.bisect_left(begins, -stamps[k])
+        begins[place : place + 1] = [-stamps[k]]
+        lengths[k] = place + 1
+    chosen: list[int] = []
+    left, last = len(begins), -math.inf
+    for k, stamp in enumerate(stamps):
+        if lengths[k] == left > 0 and stamp > last:
+            chosen.append(k)
+            left, last = left - 1, stamp
+    return chosen
 
 
 def _once(ids: NDArray[np.int64]) -> NDArray[np.bool_]:

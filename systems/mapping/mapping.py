@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -10,13 +11,14 @@ from pydrake.math import RigidTransform
 
 from systems.mapping.adjustment import Adjustment, adjust, robust_cost, settle_tags
 from systems.mapping.gathering import Gathered
-from systems.mapping.scene import Motion, Scene, residuals
+from systems.mapping.scene import Motion, Scene, corner_errors
 from systems.mapping.sightings import Sightings
 from systems.mapping.start import Start, find_start, relocate
 from systems.markers.planar_pose import angle_between, mirrored
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.intp]
 
 _NOISE_AT_FIRST = 0.5  # px, until the recording shows its own
 _MEDIAN = 7.344  # of a chi-square with 8 degrees of freedom
@@ -57,8 +59,10 @@ class TagMap:
         stamps: (frames,) of the frames, s.
         adjustment: their poses, with covariances for the noise of `pixel_noise`.
         sightings: that were used.
+        all_sightings: of those tags, used or not.
+        held: numbers of the tags whose poses were given.
         pixel_noise: of a corner's coordinate, px; as given, or as found.
-        used: part of the corners that were used.
+        used: part of the corners of those tags that were used.
         unconnected: ids of tags that no picture, through others, connects to the anchor.
         suspects: reason to what cannot be trusted, one line each; empty for a sound map.
     """
@@ -67,6 +71,8 @@ class TagMap:
     stamps: Array
     adjustment: Adjustment
     sightings: Sightings
+    all_sightings: Sightings
+    held: Indices
     pixel_noise: float
     used: float
     unconnected: list[int]
@@ -79,7 +85,9 @@ class TagMap:
 
     def chi2_per_dof(self) -> float:
         """Returns the squared residuals by degrees of freedom; 1 if the noise is as stated."""
-        return _chi2(self.adjustment) / max(_degrees(self.sightings, self.adjustment), 1)
+        return _chi2(self.adjustment) / max(
+            _degrees(self.sightings, self.adjustment, len(self.held)), 1
+        )
 
 
 def build_map(
@@ -87,6 +95,7 @@ def build_map(
     *,
     anchor: int | None = None,
     X_W_anchor: RigidTransform | None = None,
+    known: Mapping[int, RigidTransform] | None = None,
     motion: Motion | None = None,
     parameters: MappingParameters | None = None,
 ) -> TagMap:
@@ -96,6 +105,8 @@ def build_map(
         gathered: the sightings.
         anchor: id of the tag whose pose is given; None takes the one seen most often.
         X_W_anchor: its pose in the map; the identity if left out.
+        known: instead of an anchor, id to pose in the map of all tags that are known; those of them
+            that were seen stay where they are.
         motion: odometry of the camera between frames.
         parameters: what is trusted.
 
@@ -103,40 +114,55 @@ def build_map(
         The map; what makes it untrustworthy is in `suspects`.
 
     Raises:
-        ValueError: nothing was seen, or the anchor never.
+        ValueError: nothing was seen, or the anchor never, or none of the known tags.
     """
     p = parameters or MappingParameters()
     counts = gathered.sightings_of()
     require(len(counts) > 0, "recording", "without a tag seen often enough", "of tags")
-    if anchor is None:
-        anchor = int(gathered.ids[np.argmax(counts)])
-    seen = ", ".join(map(str, gathered.ids))
-    require(anchor in gathered.ids, "anchor", anchor, f"one of the tags that were seen: {seen}")
-    number = int(np.searchsorted(gathered.ids, anchor))
-    start = find_start(gathered.sightings, anchor=number, X_W_anchor=X_W_anchor or RigidTransform())
+    if known is None:
+        if anchor is None:
+            anchor = int(gathered.ids[np.argmax(counts)])
+        seen = ", ".join(map(str, gathered.ids))
+        require(anchor in gathered.ids, "anchor", anchor, f"one of the tags that were seen: {seen}")
+        known = {anchor: X_W_anchor or RigidTransform()}
+    else:
+        require(anchor is None, "anchor", anchor, "left out where known tags are given")
+        seen, given = ", ".join(map(str, gathered.ids)), ", ".join(map(str, sorted(known)))
+        some = bool(np.isin(gathered.ids, list(known)).any())
+        require(some, "known tags", given, f"in part among the tags that were seen: {seen}")
+    numbers = {int(i): k for k, i in enumerate(gathered.ids)}
+    placed = {numbers[i]: X_WT for i, X_WT in known.items() if i in numbers}
+    start = find_start(gathered.sightings, known=placed)
     unconnected = gathered.ids[~start.tags].tolist()
     ids, stamps = gathered.ids[start.tags], gathered.stamps[start.frames]
     scene, sightings = _compact(start)
     if motion is not None:
         motion = motion.over(np.flatnonzero(start.frames))
-    number = int(np.searchsorted(ids, anchor))
+    held = np.flatnonzero(np.isin(ids, list(known)))
     noise = p.pixel_noise or _NOISE_AT_FIRST
 
-    def adjusted(scene: Scene, sightings: Sightings, tolerance: float) -> Adjustment:
+    def adjusted(scene: Scene, sightings: Sightings, tolerance: float = 1e-3) -> Adjustment:
+        last = tolerance < 1e-3
         return adjust(
-            scene, sightings, anchor=number, pixel_noise=noise, motion=motion, tolerance=tolerance
+            scene,
+            sightings,
+            anchor=held,
+            pixel_noise=noise,
+            motion=motion,
+            tolerance=tolerance,
+            covariances=last,
         )
 
-    result = adjusted(scene, sightings, 1e-3)
+    result = adjusted(scene, sightings)
     for _ in range(_FLIP_ROUNDS):
-        other, gain = other_poses(result.scene, sightings, number, noise)
+        other, gain = other_poses(result.scene, sightings, held, noise)
         flipped = gain > 0
         if not flipped.any():
             break
-        result = adjusted(_with_tags(result.scene, other, flipped), sightings, 1e-3)
+        result = adjusted(_with_tags(result.scene, other, flipped), sightings)
     if not p.pixel_noise:
-        noise *= _noise_factor(result, sightings)
-        result = adjusted(result.scene, sightings, 1e-3)
+        noise *= _noise_factor(result, sightings, len(held))
+        result = adjusted(result.scene, sightings)
     everything = sightings
     for tolerance in (1e-3, 1e-7):  # what a bad start has spoiled may fit after all
         limit = _OUTLIER * noise
@@ -144,14 +170,14 @@ def build_map(
         scene = relocate(result.scene, everything, doubtful, limit)
         sightings = everything.select(_within(scene, everything, limit))
         result = adjusted(scene, sightings, tolerance)
-    _, gain = other_poses(result.scene, sightings, number, noise)
-    used = len(sightings) / len(gathered.sightings)
-    tag_map = TagMap(ids, stamps, result, sightings, noise, used, unconnected)
+    _, gain = other_poses(result.scene, sightings, held, noise)
+    used = len(sightings) / len(everything)
+    tag_map = TagMap(ids, stamps, result, sightings, everything, held, noise, used, unconnected)
     return replace(tag_map, suspects=_suspects(tag_map, gain, p))
 
 
 def _within(scene: Scene, sightings: Sightings, limit: float) -> NDArray[np.bool_]:
-    r, _, _ = residuals(scene, sightings)
+    r = corner_errors(scene, sightings)
     return np.asarray((r * r).sum(axis=1) < limit**2)
 
 
@@ -179,17 +205,17 @@ def _with_tags(scene: Scene, other: Scene, which: NDArray[np.bool_]) -> Scene:
     return replace(scene, R_WT=R, p_WT=p)
 
 
-def _noise_factor(result: Adjustment, sightings: Sightings) -> float:
+def _noise_factor(result: Adjustment, sightings: Sightings, held: int) -> float:
     """Returns the true noise by the assumed one, by the median sighting: outliers do not count."""
     m = len(sightings)
-    share = max(_degrees(sightings, result) / (8 * m), 0.1)
+    share = max(_degrees(sightings, result, held) / (8 * m), 0.1)
     return float(np.sqrt(np.median(result.squared) / (_MEDIAN * share)))
 
 
-def _degrees(sightings: Sightings, result: Adjustment) -> int:
+def _degrees(sightings: Sightings, result: Adjustment, held: int) -> int:
     tags = len(np.unique(sightings.tag))
     frames = len(np.unique(sightings.frame))
-    return 8 * len(sightings) + 6 * len(result.squared_motion) - 6 * (tags - 1) - 6 * frames
+    return 8 * len(sightings) + 6 * len(result.squared_motion) - 6 * (tags - held) - 6 * frames
 
 
 def _chi2(result: Adjustment) -> float:
@@ -197,14 +223,14 @@ def _chi2(result: Adjustment) -> float:
 
 
 def other_poses(
-    scene: Scene, sightings: Sightings, anchor: int, pixel_noise: float
+    scene: Scene, sightings: Sightings, anchor: int | Indices, pixel_noise: float
 ) -> tuple[Scene, Array]:
     """Looks for each tag's other pose: mirrored about the mean line of sight, then settled.
 
     Args:
         scene: adjusted.
         sightings: in it.
-        anchor: number of the tag that is given.
+        anchor: number of the tag that is given, or numbers of several.
         pixel_noise: of a corner's coordinate, px.
 
     Returns:

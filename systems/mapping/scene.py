@@ -96,26 +96,62 @@ def residuals(scene: Scene, sightings: Sightings) -> tuple[Array, Array, Array]:
         before the camera the residuals are infinite.
     """
     s = sightings
-    R_CW, p_CW = scene.R_CW[s.frame], scene.p_CW[s.frame]
-    arm_W = (_CORNERS * s.sizes[s.tag][:, None, None]) @ scene.R_WT[s.tag].swapaxes(1, 2)
-    arm_C = (arm_W + scene.p_WT[s.tag][:, None]) @ R_CW.swapaxes(1, 2)  # from W's origin, told in C
-    p_C = arm_C + p_CW[:, None]
-    behind = (p_C[..., 2] < _MIN_DEPTH).any(axis=1)
-    p_C[behind] = (0.0, 0.0, 1.0)
+    arm_W, arm_C, p_C, behind = _corners(scene, s)
     ray = p_C[..., :2] / p_C[..., 2:]
     by_position = np.empty((len(s), 4, 2, 3))
     by_position[..., :2] = s.by_ray
-    by_position[..., 2:] = -(s.by_ray @ ray[..., None])
+    by_position[..., 2] = -_pixels(s.by_ray, ray)
     by_position /= p_C[..., 2][..., None, None]
     by_camera = np.empty((len(s), 4, 2, 6))
-    by_camera[..., :3] = by_position @ cross_matrix(-arm_C)
+    by_camera[..., :3] = _cross(arm_C, by_position)
     by_camera[..., 3:] = by_position
     by_tag = np.empty((len(s), 4, 2, 6))
-    by_tag[..., 3:] = by_position @ R_CW[:, None]
-    by_tag[..., :3] = by_tag[..., 3:] @ cross_matrix(-arm_W)
-    r = (s.by_ray @ (ray - s.rays)[..., None])[..., 0].reshape(-1, 8)
+    # One product of 8 x 3 is faster than eight of 1 x 3.
+    moved = by_position.reshape(-1, 8, 3) @ scene.R_CW[s.frame]
+    by_tag[..., 3:] = moved.reshape(by_position.shape)
+    by_tag[..., :3] = _cross(arm_W, by_tag[..., 3:])
+    r = _pixels(s.by_ray, ray - s.rays).reshape(-1, 8)
     r[behind] = np.inf
     return r, by_camera.reshape(-1, 8, 6), by_tag.reshape(-1, 8, 6)
+
+
+def corner_errors(scene: Scene, sightings: Sightings) -> Array:
+    """Returns the residuals (m, 8) alone, px (see `residuals`)."""
+    _, _, p_C, behind = _corners(scene, sightings)
+    ray = p_C[..., :2] / p_C[..., 2:]
+    r = _pixels(sightings.by_ray, ray - sightings.rays).reshape(-1, 8)
+    r[behind] = np.inf
+    return r
+
+
+def _corners(scene: Scene, s: Sightings) -> tuple[Array, Array, Array, NDArray[np.bool_]]:
+    """Returns where the corners are: four arrays over the sightings.
+
+    Returns:
+        (m, 4, 3) from the tag's centre, told in W; from W's origin, told in C; in C; and (m,)
+        whether one of them is not before the camera: those are put on its axis.
+    """
+    R_CW, p_CW = scene.R_CW[s.frame], scene.p_CW[s.frame]
+    arm_W = (_CORNERS * s.sizes[s.tag][:, None, None]) @ scene.R_WT[s.tag].swapaxes(1, 2)
+    arm_C = (arm_W + scene.p_WT[s.tag][:, None]) @ R_CW.swapaxes(1, 2)
+    p_C = arm_C + p_CW[:, None]
+    behind = np.asarray((p_C[..., 2] < _MIN_DEPTH).any(axis=1))
+    p_C[behind] = (0.0, 0.0, 1.0)
+    return arm_W, arm_C, p_C, behind
+
+
+def _pixels(by_ray: Array, ray: Array) -> Array:
+    """Returns by_ray @ ray, of (..., 2, 2) and (..., 2)."""
+    return by_ray[..., 0] * ray[..., :1] + by_ray[..., 1] * ray[..., 1:]
+
+
+def _cross(arm: Array, rows: Array) -> Array:
+    """Returns arm x row, of (m, 4, 3) and of each row of (m, 4, 2, 3)."""
+    a, b, c = arm[:, :, None, 0], arm[:, :, None, 1], arm[:, :, None, 2]
+    x, y, z = rows[..., 0], rows[..., 1], rows[..., 2]
+    crossed = np.empty(rows.shape)
+    crossed[..., 0], crossed[..., 1], crossed[..., 2] = b * z - c * y, c * x - a * z, a * y - b * x
+    return crossed
 
 
 def motion_residuals(scene: Scene, motion: Motion) -> tuple[Array, Array, Array]:

@@ -9,6 +9,7 @@ tags, and then cameras and tags vote on each other in turn.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -75,31 +76,32 @@ class Poses:
         return Poses(R, -(R @ self.p[..., None])[..., 0])
 
 
-def find_start(sightings: Sightings, *, anchor: int, X_W_anchor: RigidTransform) -> Start:
+def find_start(sightings: Sightings, *, known: Mapping[int, RigidTransform]) -> Start:
     """Finds cameras and tags roughly.
 
     Args:
         sightings: of tags in frames.
-        anchor: number of the tag whose pose is known.
-        X_W_anchor: its pose.
+        known: number to pose of the tags whose pose is known (the anchor, or several).
     """
     good, R, p = closed_form(sightings.rays, sightings.sizes[sightings.tag])
     seen = sightings.select(good)
     poses, trust = _refined(R, p, seen)
     side = _sides(seen)
     tags = _identities(seen.tags)
-    tags.R[anchor], tags.p[anchor] = X_W_anchor.rotation().matrix(), X_W_anchor.translation()
-    connected = _chain(seen, poses, trust, side, tags, anchor)
+    anchors = np.array(list(known), np.intp)
+    for k, X_WT in known.items():
+        tags.R[k], tags.p[k] = X_WT.rotation().matrix(), X_WT.translation()
+    fixed = tags[anchors]
+    connected = _chain(seen, poses, trust, side, tags, anchors)
     mine = connected[seen.tag]
     seen, poses, trust, side = seen.select(mine), poses[mine], trust[mine], side[mine]
     cameras = _identities(seen.frames)
     for _ in range(_ROUNDS):
         X_CW = poses @ tags.inverse()[seen.tag][:, None]
         _vote_into(cameras, X_CW, trust, seen.frame, side, _depths(poses))
-        X_WT = cameras.inverse()[seen.frame][:, None] @ poses
-        fixed = tags[[anchor]]
-        _vote_into(tags, X_WT, trust, seen.tag, side, _depths(poses))
-        tags.R[anchor], tags.p[anchor] = fixed.R[0], fixed.p[0]
+        candidates = cameras.inverse()[seen.frame][:, None] @ poses
+        _vote_into(tags, candidates, trust, seen.tag, side, _depths(poses))
+        tags.R[anchors], tags.p[anchors] = fixed.R, fixed.p
     frames = np.bincount(seen.frame, minlength=seen.frames) > 0
     return Start(Scene(cameras.R, cameras.p, tags.R, tags.p), connected, frames, seen)
 
@@ -169,9 +171,11 @@ def _depths(poses: Poses) -> Array:
 
 
 def _chain(
-    seen: Sightings, poses: Poses, trust: Array, side: Array, tags: Poses, anchor: int
+    seen: Sightings, poses: Poses, trust: Array, side: Array, tags: Poses, anchors: Indices
 ) -> NDArray[np.bool_]:
-    """Places the tags that pairs connect to the anchor; returns which those are."""
+    """Places the tags that pairs connect to the anchors; returns which those are."""
+    connected = np.zeros(seen.tags, bool)
+    connected[anchors] = True
     first, second = _pairs(seen.frame)
     a, b = seen.tag[first], seen.tag[second]
     swap = a > b
@@ -186,8 +190,6 @@ def _chain(
         relative, both, group, len(keys), np.minimum(side[first], side[second]), reach
     )
     low, high = keys // seen.tags, keys % seen.tags
-    connected = np.zeros(seen.tags, bool)
-    connected[anchor] = True
     while True:  # Prim's tree: the surest pair that leads to a new tag
         useful = connected[low] != connected[high]
         if not useful.any():

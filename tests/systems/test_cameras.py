@@ -285,6 +285,63 @@ def test_a_camera_file_that_is_refused_says_which_key(
         load_camera(path)
 
 
+KALIBR = """
+cam0:
+  camera_model: pinhole
+  intrinsics: [461.6, 460.3, 362.7, 248.1]
+  distortion_model: radtan
+  distortion_coeffs: [-0.28, 0.07, 0.0002, 0.00002]
+  resolution: [752, 480]
+  rostopic: /cam0/image_raw
+cam1:
+  T_cn_cnm1: [[1, 0, 0, -0.11], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+  camera_model: pinhole
+  intrinsics: [457.6, 456.1, 379.9, 255.2]
+  distortion_model: none
+  distortion_coeffs: []
+  resolution: [752, 480]
+"""
+
+
+def test_kalibrs_cameras_are_read_by_name(tmp_path: Path) -> None:
+    path = tmp_path / "cameras.yaml"
+    path.write_text(KALIBR)
+    first = load_camera(tmp_path / "cameras.yaml:cam0")
+    assert (first.width, first.height) == (752, 480)
+    np.testing.assert_array_equal(first.K, [[461.6, 0, 362.7], [0, 460.3, 248.1], [0, 0, 1]])
+    np.testing.assert_array_equal(first.D, [-0.28, 0.07, 0.0002, 0.00002, 0])
+    assert not load_camera(tmp_path / "cameras.yaml:cam1").distorted
+    path.write_text(KALIBR[: KALIBR.index("cam1")])
+    np.testing.assert_array_equal(load_camera(path).K, first.K)  # of one camera no name is needed
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "words"),
+    [
+        ("", ("", ""), "cameras is 'cam0, cam1': must be one: name it, as in FILE:cam0"),
+        (":cam7", ("", ""), "camera is 'cam7': must be one of cam0, cam1"),
+        (":cam0", ("radtan", "equidistant"), "cam0.distortion_model is 'equidistant': must be "
+                  "radtan, plumb_bob, none: no other is modelled"),
+        (":cam0", ("pinhole", "omni"), "cam0.camera_model is 'omni': must be pinhole"),
+        (":cam0", ("[752, 480]", "752"), "cam0.resolution is 752: must be a list of 2 numbers"),
+        (":cam0", ("  resolution: [752, 480]\n", ""), "cam0 lacks the key 'resolution'"),
+    ],
+)  # fmt: skip
+def test_a_kalibr_file_that_is_refused_says_why(
+    tmp_path: Path, name: str, change: tuple[str, str], words: str
+) -> None:
+    (tmp_path / "cameras.yaml").write_text(KALIBR.replace(*change, 1) if change[0] else KALIBR)
+    with pytest.raises(ValueError, match=r"camera file .*cameras.yaml: ") as caught:
+        load_camera(tmp_path / f"cameras.yaml{name}")
+    assert words in str(caught.value)
+
+
+def test_a_name_of_a_camera_is_for_files_with_names(tmp_path: Path) -> None:
+    PinholeCamera.from_focal_length(64, 48, 50.0).save(tmp_path / "ours.yaml")
+    with pytest.raises(ValueError, match="camera is 'cam0': must be left out"):
+        load_camera(tmp_path / "ours.yaml:cam0")
+
+
 def test_a_camera_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"lost\.yaml: No such file"):
         load_camera(tmp_path / "lost.yaml")

@@ -57,6 +57,21 @@ def test_what_cannot_be_used_is_counted() -> None:
     assert found.sightings_of().tolist() == [4, 3]
 
 
+@pytest.mark.parametrize(
+    ("stamps", "kept"),
+    [
+        ([0, 1, 2, 900, 3, 4, 5], [0, 1, 2, 3, 4, 5]),  # one far ahead
+        ([5, 6, 7, 0, 1, 2, 3], [0, 1, 2, 3]),  # a clock that was set back: the longer part
+        ([3, 2, 1], [3]),  # the earliest of several
+        ([1, 1, 2, np.inf, 2, np.nan, 3], [1, 2, 3]),
+    ],
+)
+def test_frames_that_most_stamps_agree_with_stay(stamps: list[float], kept: list[float]) -> None:
+    found = gather([frame(t, 4) for t in stamps], camera=CAMERA, size=0.2, min_frames=1)
+    assert found.stamps.tolist() == kept
+    assert found.dropped["bad_stamp"] == len(stamps) - len(kept)
+
+
 def test_pixels_that_the_lens_model_cannot_explain_are_bad_corners() -> None:
     lens = type(CAMERA)(640, 480, CAMERA.K, np.array([-0.9, 0.0, 0.0, 0.0, 0.0]))
     far = SQUARE + np.array([480.0, 320.0])

@@ -9,6 +9,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from systems.cameras import PinholeCamera
 from systems.mapping.gathering import gather
 from systems.mapping.mapping import MappingParameters, TagMap, build_map, other_poses
+from systems.mapping.scene import rotation_vector
 from tests.mapping_world import CAMERA, SIZE, Circuit, circuit
 
 
@@ -111,3 +112,47 @@ def test_without_an_anchor_the_most_seen_tag_is_the_origin() -> None:
     place = int(np.flatnonzero(tag_map.ids == most)[0])
     np.testing.assert_array_equal(tag_map.adjustment.scene.p_WT[place], 0)
     np.testing.assert_array_equal(tag_map.adjustment.scene.R_WT[place], np.eye(3))
+
+
+def known(world: Circuit, *tags: int) -> dict[int, RigidTransform]:
+    """Returns the true poses of some tags."""
+    scene = world.scene
+    return {k: RigidTransform(RotationMatrix(scene.R_WT[k]), scene.p_WT[k]) for k in tags}
+
+
+def test_known_tags_stay_and_the_others_are_added_to_them() -> None:
+    world = circuit()
+    gathered = gather(world.detections(0.3), camera=CAMERA, size=SIZE)
+    half = known(world, *range(0, 24, 2))
+    tag_map = build_map(gathered, known=half | {500: RigidTransform()})  # one that is not there
+    assert tag_map.suspects == {}
+    assert tag_map.held.tolist() == list(range(0, 24, 2))
+    np.testing.assert_array_equal(tag_map.adjustment.scene.p_WT[::2], world.scene.p_WT[::2])
+    assert not tag_map.adjustment.tag_covariance[::2].any()
+    assert error(tag_map, world) < 0.02  # no way is long from what is known
+    assert tag_map.chi2_per_dof() == pytest.approx(1.0, abs=0.1)
+
+
+def test_against_a_whole_map_only_cameras_are_found() -> None:
+    world = circuit()
+    gathered = gather(world.detections(0.3), camera=CAMERA, size=SIZE)
+    tag_map = build_map(gathered, known=known(world, *range(24)))
+    assert tag_map.suspects == {}
+    scene, P = tag_map.adjustment.scene, tag_map.adjustment.camera_covariance
+    error = np.concatenate(
+        [
+            rotation_vector(scene.R_CW @ world.scene.R_CW.swapaxes(1, 2)),
+            scene.p_CW - world.scene.p_CW,
+        ],
+        axis=1,
+    )
+    nees = (error * np.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1) / 6
+    assert nees.mean() == pytest.approx(1.0, abs=0.15)
+
+
+def test_known_tags_must_be_among_those_seen() -> None:
+    gathered = gather(circuit().detections(0.3), camera=CAMERA, size=SIZE)
+    with pytest.raises(ValueError, match="known tags is '77, 80': must be in part among the tags"):
+        build_map(gathered, known={77: RigidTransform(), 80: RigidTransform()})
+    with pytest.raises(ValueError, match="anchor is 3: must be left out"):
+        build_map(gathered, anchor=3, known={3: RigidTransform()})
