@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table as RichTable
 
+from diagrams.map_command import add_arguments as add_map_arguments
 from systems.validation import require
 
 if TYPE_CHECKING:
@@ -111,6 +112,8 @@ def _parser() -> argparse.ArgumentParser:
     markers.add_argument("map", help="marker map (JSON), a path or a bundled name")
     markers.add_argument("-o", "--out", type=Path, default=Path("markers.pdf"), metavar="FILE")
     markers.add_argument("--page", default="auto", help="A4, A3, letter or auto")
+
+    add_map_arguments(command("map", _map, "map the tags of a recording"))
 
     detect = command("detect", _detect, "find markers in pictures, videos, recordings")
     detect.add_argument("source", type=Path, help="picture, folder, video or recording")
@@ -255,6 +258,13 @@ def _detect(options: argparse.Namespace) -> int:
     console.print(table)
     console.print(f"results: {options.out}")
     return 0
+
+
+def _map(options: argparse.Namespace) -> int:
+    from diagrams.map_command import run_map
+
+    with _progress() as progress:
+        return run_map(options, console, progress)
 
 
 @contextmanager

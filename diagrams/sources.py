@@ -69,6 +69,20 @@ def pictures(source: Path) -> Iterator[Picture]:
             yield from _recording(path, prefix)
 
 
+def is_recording(source: Path) -> bool:
+    """Whether a path is to be read as one recording: a bag's folder, or a file that is no picture.
+
+    Raises:
+        ScenarioError: there is nothing at the path.
+    """
+    if not source.exists():
+        raise ScenarioError(f"{source}: no such file or folder")
+    if source.is_dir():
+        names = [path.name for path in source.iterdir()]
+        return "metadata.yaml" in names or any(name.endswith((".mcap", ".db3")) for name in names)
+    return source.suffix.lower() not in (*PICTURES, *VIDEOS)
+
+
 def _files(source: Path) -> Iterator[Path]:
     if not source.exists():
         raise ScenarioError(f"{source}: no such file or folder")
@@ -117,16 +131,16 @@ def _recording(path: Path, prefix: str) -> Iterator[Picture]:
     if not images:
         have = ", ".join(f"{t} ({k})" for t, k in sorted(topics.items()))
         raise ScenarioError(f"recording {path}: no pictures in it; it has {have}")
-    cameras = _cameras(reader)
+    cameras = cameras_of(reader)
     counts = dict.fromkeys(images, 0)
     for topic, _, message in reader.messages(images):
         picture = image_from_ros(message)
         name = f"{prefix}{topic.strip('/').replace('/', '_')}_{counts[topic]:06d}.png"
         counts[topic] += 1
-        yield Picture(name, picture.stamp, picture.data, _camera_of(topic, cameras))
+        yield Picture(name, picture.stamp, picture.data, camera_of(topic, cameras))
 
 
-def _cameras(reader: BagReader) -> dict[str, PinholeCamera]:
+def cameras_of(reader: BagReader) -> dict[str, PinholeCamera]:
     """Returns the calibrated cameras of a recording, by the topic of their CameraInfo."""
     kinds = reader.topics()
     infos = [topic for topic, kind in kinds.items() if kind == "sensor_msgs/msg/CameraInfo"]
@@ -142,7 +156,7 @@ def _cameras(reader: BagReader) -> dict[str, PinholeCamera]:
     return cameras
 
 
-def _camera_of(topic: str, cameras: dict[str, PinholeCamera]) -> PinholeCamera | None:
+def camera_of(topic: str, cameras: dict[str, PinholeCamera]) -> PinholeCamera | None:
     """Returns the camera whose topic shares the longest beginning with a picture's topic."""
     if len(cameras) <= 1:
         return next(iter(cameras.values()), None)

@@ -177,7 +177,7 @@ def detections_from_ros(
     Raises:
         ValueError: no or several families, or an unknown one.
     """
-    entries = message.detections if hasattr(message, "detections") else message.apriltags
+    entries = tags_of(message)
     names = {family} if family else {entry.family for entry in entries}
     require(len(names) <= 1, "families", sorted(names), "one in an array")
     corners = [[(p.x, p.y) for p in reversed(entry.corners)] for entry in entries]
@@ -190,6 +190,11 @@ def detections_from_ros(
         hamming=np.array([entry.hamming for entry in entries], np.int64),
         decision_margin=np.array([getattr(e, "decision_margin", math.nan) for e in entries], float),
     )
+
+
+def tags_of(message: Any) -> list[Any]:
+    """Returns the entries of an `AprilTagDetectionArray` or an `ApriltagArrayStamped`."""
+    return list(message.detections if hasattr(message, "detections") else message.apriltags)
 
 
 def homographies(corners: Array) -> Array:

@@ -33,7 +33,7 @@ _LEAST = 1e-9  # information of what nothing is known of, 1/rad^2 and 1/m^2
 _ROUNDING = 1e-12  # of a block's diagonal, that it be positive whatever rounding does
 _SIX = np.arange(6)
 _HOPELESS = 1e12  # chi-square of what is behind the camera, where infinity cannot be compared
-_CHUNK = 128  # frames that are eliminated at a time: bounds the memory
+CHUNK = 128  # frames that are eliminated at a time: bounds the memory
 _HUBER = 6.0  # of a sighting's 8 residuals in units of their noise: 36 is their 1 - 2e-5 quantile
 
 
@@ -62,7 +62,7 @@ class Adjustment:
     camera_covariance: Array
 
 
-class _System:
+class System:
     """The normal equations of a step, and their solution with the cameras eliminated."""
 
     def __init__(
@@ -78,7 +78,7 @@ class _System:
         r, by_camera, by_tag = residuals(scene, s)
         self.squared = (r * r).sum(axis=1)
         weight = np.minimum(1.0, huber / np.sqrt(np.maximum(self.squared, 1e-300)))
-        self.cost = float(_huber(self.squared, huber).sum())
+        self.cost = float(_huber(np.minimum(self.squared, _HOPELESS), huber).sum())
         self.squared_motion = np.zeros(0)
         r[~np.isfinite(self.squared)] = 0.0
         weighted = np.sqrt(weight)[:, None]
@@ -86,10 +86,10 @@ class _System:
         product = J.swapaxes(1, 2) @ J
         self.sightings = s
         self.cross = product[:, :6, 6:12]
-        self.H_cameras = _summed(product[:, :6, :6], s.frame, frames)
-        self.g_cameras = _summed(product[:, :6, 12], s.frame, frames)
-        self.H_tags = _summed(product[:, 6:12, 6:12], s.tag, tags)
-        self.g_tags = _summed(product[:, 6:12, 12], s.tag, tags)
+        self.H_cameras = summed(product[:, :6, :6], s.frame, frames)
+        self.g_cameras = summed(product[:, :6, 12], s.frame, frames)
+        self.H_tags = summed(product[:, 6:12, 6:12], s.tag, tags)
+        self.g_tags = summed(product[:, 6:12, 12], s.tag, tags)
         self.coupling: Array | None = None
         if motion is not None:
             e, here, there = motion_residuals(scene, motion)
@@ -148,8 +148,8 @@ class _System:
         s, t = self.sightings, len(self.free)
         last = np.zeros((6, 6 * t + 1))
         columns = 6 * self.place[s.tag]
-        for start in range(0, s.frames, _CHUNK):
-            end = min(start + _CHUNK, s.frames)
+        for start in range(0, s.frames, CHUNK):
+            end = min(start + CHUNK, s.frames)
             Y = np.zeros((end - start, 6, 6 * t + 1))
             Y[:, :, -1] = -self.g_cameras[start:end]
             mine = np.arange(*np.searchsorted(s.frame, [start, end]))
@@ -177,7 +177,7 @@ class _System:
         """Returns the steps (frames, 6) of the cameras, given those of the tags."""
         s = self.sightings
         pull = (self.cross @ tags[s.tag][..., None])[..., 0]
-        right = -self.g_cameras - _summed(pull, s.frame, s.frames)
+        right = -self.g_cameras - summed(pull, s.frame, s.frames)
         y = (inverse @ right[..., None])[..., 0]
         if self.coupling is not None:
             for k in range(1, len(y)):
@@ -214,7 +214,7 @@ class _System:
         return of_tags, P + spread @ spread.swapaxes(1, 2)
 
 
-def _summed(values: Array, index: NDArray[np.intp], count: int) -> Array:
+def summed(values: Array, index: NDArray[np.intp], count: int) -> Array:
     """Returns (count, ...) sums of the values (m, ...) of each index."""
     flat = values.reshape(len(values), -1)
     total = np.empty((count, flat.shape[1]))
@@ -275,7 +275,7 @@ def adjust(
     """
     scaled = replace(sightings, by_ray=sightings.by_ray / pixel_noise)
     damping, converged, tries = _DAMPING_START, False, 0
-    system = _System(scene, scaled, motion, anchor, huber)
+    system = System(scene, scaled, motion, anchor, huber)
     while tries < iterations and damping < _DAMPING_END:
         tries += 1
         cameras, tags, gain = system.step(damping)
@@ -283,7 +283,7 @@ def adjust(
             converged = True
             break
         moved = scene.moved(cameras, tags)
-        trial = _System(moved, scaled, motion, anchor, huber)
+        trial = System(moved, scaled, motion, anchor, huber)
         if trial.cost < system.cost:
             scene, system, damping = moved, trial, damping * 0.1
         else:
@@ -319,7 +319,7 @@ def settle_tags(
         weight = np.minimum(1.0, _HUBER / np.sqrt(np.maximum(squared, 1e-300)))
         r[~np.isfinite(squared)] = 0.0
         J = np.concatenate([by_tag, r[..., None]], axis=2) * np.sqrt(weight)[:, None, None]
-        product = _summed(J.swapaxes(1, 2) @ J, s.tag, s.tags)
+        product = summed(J.swapaxes(1, 2) @ J, s.tag, s.tags)
         H = product[:, :6, :6]
         H = H + np.eye(6) * (damping[:, None, None] * H + _LEAST)
         steps = np.asarray(-np.linalg.solve(H, product[:, :6, 6:])[..., 0], np.float64)

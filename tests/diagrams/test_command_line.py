@@ -46,7 +46,7 @@ def test_arguments_that_make_no_sense_are_refused_in_one_line(
 def test_help_shows_every_command(tagtrail: Callable[..., Any]) -> None:
     result = tagtrail("--help")
     assert result.status == 0
-    for command in ("list", "run", "study", "diagram", "markers", "detect"):
+    for command in ("list", "run", "study", "diagram", "markers", "map", "detect"):
         assert f"\n    {command} " in result.out
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from systems.mapping.adjustment import _System, adjust
+from systems.mapping.adjustment import System, adjust
 from systems.mapping.scene import Motion, Scene, motion_residuals, residuals, rotation_vector
 from systems.mapping.sightings import Sightings
 from systems.markers.pnp import rotation_from_vector
@@ -81,7 +81,7 @@ def test_steps_and_covariances_are_those_of_dense_algebra(
     sightings = world.sightings(noise=0.5)
     scene = moved(world.scene, 0.02, rng)
     motion = motion_of(world.scene, rng) if with_motion else None
-    system = _System(scene, sightings, motion, anchor=0, huber=np.inf)
+    system = System(scene, sightings, motion, anchor=0, huber=np.inf)
     J, r = dense(scene, sightings, motion)
     free = np.r_[0 : 6 * sightings.frames, 6 * sightings.frames + 6 : J.shape[1]]
     H = J[:, free].T @ J[:, free]
