@@ -11,7 +11,9 @@ Tangents: rotation first, a small rotation vector in the parent (C for cameras, 
 the position in the parent. A sighting that fits badly counts less (Huber; of its 8 residuals
 together).
 
-Source: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000.
+Sources: Triggs, McLauchlan, Hartley, Fitzgibbon, "Bundle adjustment - a modern synthesis", 2000;
+damping by the part of the promised gain that came true: Nielsen, "Damping parameter in Marquardt's
+method", IMM-REP-1999-05.
 """
 
 from __future__ import annotations
@@ -28,7 +30,11 @@ from systems.mapping.sightings import Sightings
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
 
-_DAMPING_START, _DAMPING_END = 1e-6, 1e8
+# The same for all, 1/rad^2 and 1/m^2: it holds back what is hardly known, such as the lean of a tag
+# seen from the front, which a part of each diagonal would not.
+_DAMPING_START, _DAMPING_LEAST, _DAMPING_END = 1.0, 1e-4, 1e12
+_TAG_DAMPING = 1e-6  # of the diagonals, when tags are settled alone
+_GROWTH = 4.0  # of the damping after a step that failed; twice that after the next one
 _LEAST = 1e-9  # information of what nothing is known of, 1/rad^2 and 1/m^2
 _ROUNDING = 1e-12  # of a block's diagonal, that it be positive whatever rounding does
 _SIX = np.arange(6)
@@ -238,9 +244,8 @@ def _inverse_root(S: Array) -> Array:
 
 def _damped(H: Array, damping: float) -> Array:
     """Returns blocks (n, 6, 6) with their diagonals raised; one of nothing becomes harmless."""
-    return H + np.eye(6) * (
-        (damping + _ROUNDING) * np.diagonal(H, axis1=1, axis2=2)[:, None, :] + _LEAST
-    )
+    raised = _ROUNDING * np.diagonal(H, axis1=1, axis2=2)[:, None, :] + damping + _LEAST
+    return H + np.eye(6) * raised
 
 
 def adjust(
@@ -274,7 +279,7 @@ def adjust(
         The best scene, with marginal covariances for the given noise.
     """
     scaled = replace(sightings, by_ray=sightings.by_ray / pixel_noise)
-    damping, converged, tries = _DAMPING_START, False, 0
+    damping, growth, converged, tries = _DAMPING_START, _GROWTH, False, 0
     system = System(scene, scaled, motion, anchor, huber)
     while tries < iterations and damping < _DAMPING_END:
         tries += 1
@@ -284,10 +289,12 @@ def adjust(
             break
         moved = scene.moved(cameras, tags)
         trial = System(moved, scaled, motion, anchor, huber)
-        if trial.cost < system.cost:
-            scene, system, damping = moved, trial, damping * 0.1
+        kept = (system.cost - trial.cost) / gain  # of the promise
+        if kept > 0:
+            scene, system, growth = moved, trial, _GROWTH
+            damping = max(damping * max(0.1, 1 - (2 * kept - 1) ** 3), _DAMPING_LEAST)
         else:
-            damping *= 10.0
+            damping, growth = damping * growth, 2 * growth
     none = np.zeros((0, 6, 6))
     of_tags, of_cameras = system.covariances() if covariances else (none, none)
     return Adjustment(
@@ -311,7 +318,7 @@ def settle_tags(
 ) -> Scene:
     """Moves each tag to where its own sightings have it, the cameras fixed; all tags at once."""
     s = replace(sightings, by_ray=sightings.by_ray / pixel_noise)
-    damping = np.full(s.tags, _DAMPING_START)
+    damping = np.full(s.tags, _TAG_DAMPING)
     cost = robust_cost(scene, s, 1.0)
     for _ in range(iterations):
         r, _, by_tag = residuals(scene, s)

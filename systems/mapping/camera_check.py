@@ -32,7 +32,7 @@ _FITS = 0.5  # of the misfit, at most, is left where one of them is right
 _EXPLAINS = 0.1  # of the cost, at least, goes where something was told wrong
 _HARMLESS = 0.01  # of the focal length, and of sizes
 _HARMLESS_PX = 1.0  # of the distortion, RMS over the corners
-_LAST_DAMPING = 1e8
+_LAST_DAMPING = 1e12
 _LONGEST = 0.3  # step of a value
 _FIXED = 1e30  # information of what is not free
 
@@ -83,7 +83,7 @@ def free_camera(
     values = np.zeros(4)
     seen = model.sightings(values)
     system = System(scene, seen, None, held, _HUBER)
-    before, damping = system.cost, 1e-6
+    before, damping = system.cost, 1.0
     for _ in range(_ITERATIONS):
         cameras, tags, step, gain, _ = _step(
             system, scene, model.derivatives(scene, seen, values), free, damping
@@ -260,7 +260,7 @@ def _step(
     with_cameras = summed(by_camera.swapaxes(1, 2) @ J, s.frame, s.frames)  # (frames, 6, 4)
     with_tags = summed(by_tag.swapaxes(1, 2) @ J, s.tag, s.tags)[system.free].reshape(6 * t, 4)
     own = np.einsum("mki,mkj->ij", J, J / np.maximum(weight, 1e-12)[:, None, None])
-    own += np.diag(np.where(free, damping * np.diagonal(own), _FIXED))
+    own += np.diag(np.where(free, damping, _FIXED))
     right = -np.einsum("mki,mk->i", J, r)
     gradient = -right
     inverse, before, S, b = system.factor(damping)

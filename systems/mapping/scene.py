@@ -44,12 +44,29 @@ class Scene:
 
     def moved(self, cameras: Array, tags: Array) -> Scene:
         """Returns it after steps (frames, 6) and (tags, 6)."""
-        return Scene(
-            rotation_from_vector(cameras[:, :3]) @ self.R_CW,
-            self.p_CW + cameras[:, 3:],
-            rotation_from_vector(tags[:, :3]) @ self.R_WT,
-            self.p_WT + tags[:, 3:],
-        )
+        R_CW, p_CW = _screwed(self.R_CW, self.p_CW, cameras)
+        R_WT, p_WT = _screwed(self.R_WT, self.p_WT, tags)
+        return Scene(R_CW, p_CW, R_WT, p_WT)
+
+
+def _screwed(R: Array, p: Array, steps: Array) -> tuple[Array, Array]:
+    """Returns poses after steps (n, 6), along screws.
+
+    To first order that is a turn and a shift. But what turns together, cameras and tags about a far
+    anchor, does so on circles: on straight lines the adjustment would creep along every bend.
+    """
+    turn, shift = steps[:, :3], steps[:, 3:]
+    v = (shift - np.cross(turn, p))[..., None]
+    squared = (turn * turn).sum(axis=1)
+    angle = np.sqrt(squared)
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    a = np.where(small, 0.5 - squared / 24, (1 - np.cos(safe)) / safe**2)
+    b = np.where(small, 1 / 6 - squared / 120, (safe - np.sin(safe)) / safe**3)
+    K = cross_matrix(turn)
+    turned = rotation_from_vector(turn)
+    along = v + a[:, None, None] * (K @ v) + b[:, None, None] * (K @ (K @ v))
+    return turned @ R, (turned @ p[..., None] + along)[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
