@@ -18,8 +18,8 @@ from systems.markers.pnp import refine
 
 Array = NDArray[np.float64]
 
-# The second pose's reprojection error by the first one's, at least. Of 1.2, 1.5, 2 and 3 this is the
-# best for the chain.
+# The second pose's reprojection error by the first one's, at least. Of 1.2, 1.5, 2 and 3 this is
+# the best for the chain.
 GATE = 1.2
 
 
