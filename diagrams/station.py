@@ -44,6 +44,7 @@ BODIES = Table(
     "body",
     {
         "differential_drive": "diagrams.drivers.body:DifferentialDriveBody",
+        "limo": "diagrams.drivers.limo_body:LimoBody",
         "snailbot": "diagrams.drivers.shell_body:SnailBotBody",
     },
     resources=frozenset({"shell"}),
@@ -73,7 +74,17 @@ SENSORS = Table(
 )
 
 # Names of blocks, ports and topics of a robot that its devices must leave free.
-_TAKEN = ("drive", "estimate", "servos", "state", "twin", "wheels", "wheel_angles")
+_TAKEN = (
+    "drive",
+    "estimate",
+    "odom",
+    "servos",
+    "state",
+    "twin",
+    "wheels",
+    "wheel_angles",
+    "wheel_rates",
+)
 
 RENDERER = "vtk"
 

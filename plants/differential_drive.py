@@ -6,28 +6,36 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from pydrake.geometry import Box, Cylinder, Sphere
-from pydrake.math import RigidTransform, RotationMatrix, cos, sin
+from pydrake.geometry import Box, Sphere
+from pydrake.math import RigidTransform, cos, sin
 from pydrake.multibody.plant import CoulombFriction, MultibodyPlant
 from pydrake.multibody.tree import (
-    FixedOffsetFrame,
     ModelInstanceIndex,
     PdControllerGains,
     RevoluteJoint,
-    RigidBody,
     SpatialInertia,
 )
 from pydrake.systems.framework import BasicVector_, LeafSystem_
 from pydrake.systems.scalar_conversion import TemplateSystem
 
 from plants.motors import MotorModel
+from plants.wheels import Sides, add_wheel, body_velocity, servo_matrix, wheel_speeds
 from systems.validation import require, require_positive
-
-Array = NDArray[np.float64]
 
 _WHEEL_FRICTION = CoulombFriction(1.0, 1.0)
 _NO_FRICTION = CoulombFriction(0.0, 0.0)
+__all__ = [
+    "DifferentialDriveParameters",
+    "KinematicDifferentialDrive",
+    "KinematicDifferentialDrive_",
+    "add_differential_drive",
+    "body_velocity",
+    "hull",
+    "hull_radius",
+    "servo_matrix",
+    "wheel_speeds",
+]
+
 _CREEP = 1e-3  # rad/s, at which a wheel held by its gear's friction gives way
 
 
@@ -77,23 +85,6 @@ class DifferentialDriveParameters:
             self.caster_radius,
             f"at most half the clearance of {self.clearance:.3g} m",
         )
-
-
-def body_velocity(wheel_speeds: Any, parameters: DifferentialDriveParameters) -> list[Any]:
-    """Returns [v (m/s), omega (rad/s)] of wheel speeds [right, left] (rad/s), without slip.
-
-    v = r (w_r + w_l) / 2, omega = r (w_r - w_l) / b ([NAV]).
-    """
-    r, b = parameters.wheel_radius, parameters.base
-    right, left = wheel_speeds
-    return [r * (right + left) / 2, r * (right - left) / b]
-
-
-def wheel_speeds(command: Any, parameters: DifferentialDriveParameters) -> list[Any]:
-    """Returns the wheel speeds [right, left] (rad/s) of [v (m/s), omega (rad/s)]: the inverse."""
-    r, b = parameters.wheel_radius, parameters.base
-    v, omega = command
-    return [(v + omega * b / 2) / r, (v - omega * b / 2) / r]
 
 
 def hull_radius(parameters: DifferentialDriveParameters) -> float:
@@ -169,26 +160,19 @@ def add_differential_drive(
         )
         plant.RegisterCollisionGeometry(chassis, X_BCaster, caster, f"{end}_caster", _NO_FRICTION)
     for side, y in (("right", -1.0), ("left", 1.0)):
-        joint = _add_wheel(plant, model, chassis, p, side, y)
+        joint = add_wheel(
+            plant,
+            model,
+            chassis,
+            name=f"{side}_wheel",
+            position=np.array([0.0, y * p.base / 2, p.wheel_radius]),
+            radius=p.wheel_radius,
+            width=p.wheel_width,
+            mass=p.wheel_mass,
+            friction=_WHEEL_FRICTION,
+        )
         _add_actuators(plant, joint, p, side, motor)
     return model
-
-
-def servo_matrix(plant: MultibodyPlant, model: ModelInstanceIndex) -> Array:
-    """Returns the matrix from [right, left] (rad/s) to the `desired_state` of the wheels.
-
-    The speeds are set-points of speed servos, or the `servo_speeds` of `DcMotors`. Positions have
-    no gain and the gears' friction holds the wheels back toward speed 0.
-    """
-    actuators = plant.num_actuators(model)
-    drives = [
-        row
-        for row, index in enumerate(plant.GetJointActuatorIndices(model))
-        if plant.get_joint_actuator(index).name() in ("right_motor", "left_motor")
-    ]
-    matrix = np.zeros((2 * actuators, 2))
-    matrix[[actuators + row for row in drives], [0, 1]] = 1.0
-    return matrix
 
 
 def _add_actuators(
@@ -213,57 +197,6 @@ def _add_actuators(
     actuator.set_default_gear_ratio(motor.parameters.gear_ratio)
 
 
-def _add_wheel(
-    plant: MultibodyPlant,
-    model: ModelInstanceIndex,
-    chassis: RigidBody,
-    p: DifferentialDriveParameters,
-    side: str,
-    y: float,
-) -> RevoluteJoint:
-    wheel = plant.AddRigidBody(
-        f"{side}_wheel",
-        model,
-        SpatialInertia.SolidCylinderWithMass(
-            p.wheel_mass, p.wheel_radius, p.wheel_width, np.array([0.0, 1.0, 0.0])
-        ),
-    )
-    axle = plant.AddFrame(
-        FixedOffsetFrame(
-            f"{side}_axle",
-            chassis.body_frame(),
-            RigidTransform([0.0, y * p.base / 2, p.wheel_radius]),
-            model,
-        )
-    )
-    joint = plant.AddJoint(
-        RevoluteJoint(
-            f"{side}_wheel",
-            axle,
-            wheel.body_frame(),
-            np.array([0.0, 1.0, 0.0]),
-        )
-    )
-    plant.RegisterVisualGeometry(
-        wheel,
-        RigidTransform(RotationMatrix.MakeXRotation(np.pi / 2)),
-        Cylinder(p.wheel_radius, p.wheel_width),
-        "tyre",
-        np.array([0.1, 0.1, 0.1, 1.0]),
-    )
-    plant.RegisterVisualGeometry(  # a spoke, so that one sees the wheel turn
-        wheel,
-        RigidTransform(),
-        Box(1.6 * p.wheel_radius, 1.02 * p.wheel_width, 0.004),
-        "spoke",
-        np.array([0.9, 0.9, 0.9, 1.0]),
-    )
-    plant.RegisterCollisionGeometry(
-        wheel, RigidTransform(), Sphere(p.wheel_radius), "tyre", _WHEEL_FRICTION
-    )
-    return joint
-
-
 @TemplateSystem.define("KinematicDifferentialDrive_")
 def KinematicDifferentialDrive_(T: Any) -> Any:  # noqa: D103 - the class carries the documentation
     class Impl(LeafSystem_[T]):
@@ -279,7 +212,7 @@ def KinematicDifferentialDrive_(T: Any) -> Any:  # noqa: D103 - the class carrie
             - velocity
 
         Args:
-            parameters: dimensions.
+            parameters: dimensions; of any robot with two driven sides.
 
         Ports:
             wheel_speeds (input, vector of 2): [right, left] (rad/s).
@@ -291,11 +224,9 @@ def KinematicDifferentialDrive_(T: Any) -> Any:  # noqa: D103 - the class carrie
         AutoDiffXd, Expression.
         """
 
-        def _construct(
-            self, *, parameters: DifferentialDriveParameters | None = None, converter: Any = None
-        ) -> None:
+        def _construct(self, *, parameters: Sides | None = None, converter: Any = None) -> None:
             super().__init__(converter=converter)
-            self.parameters = parameters or DifferentialDriveParameters()
+            self.parameters: Sides = parameters or DifferentialDriveParameters()
             self._wheel_speeds_input = self.DeclareVectorInputPort(
                 "wheel_speeds", BasicVector_[T](2)
             )

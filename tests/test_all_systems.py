@@ -90,6 +90,7 @@ from systems.estimators.pose_chain import PoseChain
 from systems.estimators.reference_motion import CarriedShellMotion, KnownShellMotion
 from systems.estimators.shell_ekf import ShellEkf
 from systems.estimators.shell_rule import ShellRule
+from systems.estimators.wheel_odometry import WheelOdometry
 from systems.estimators.wheel_speeds import WheelSpeeds
 from systems.flow.lucas_kanade import PointTracker
 from systems.flow.mean_flow import MeanFlow
@@ -750,6 +751,10 @@ CASES: dict[type, Callable[[Path], Case]] = {
     WheelDrive: lambda _: Case(
         WheelDrive(to_wheel_speeds=lambda c: wheel_speeds(c, DifferentialDriveParameters())),
         {"command": vector(0.3, 0.2)},
+    ),
+    WheelOdometry: lambda _: Case(
+        WheelOdometry(ticks_per_turn=80.0, wheel_radius=0.045, track=0.4),
+        {"ticks": vector(100.0, 120.0)},
     ),
     WheelSpeeds: lambda _: Case(WheelSpeeds(ticks_per_turn=80.0), {"ticks": vector(100.0, 120.0)}),
     UltrasonicRing: lambda _: Case(

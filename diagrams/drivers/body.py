@@ -1,12 +1,13 @@
-"""The body of a differential-drive robot in a station: multibody model or kinematic twin."""
+"""Bodies of robots with two driven sides in a station: multibody model or kinematic twin."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
 import numpy as np
 from pydrake.systems.framework import BasicVector, OutputPort
-from pydrake.systems.primitives import Demultiplexer, Integrator, MatrixGain, PassThrough
+from pydrake.systems.primitives import Integrator, MatrixGain, PassThrough
 
 from diagrams.channels import truth_signal
 from diagrams.station import Robot, StationBuilder
@@ -17,58 +18,37 @@ from plants.differential_drive import (
     add_differential_drive,
     hull,
     hull_radius,
-    servo_matrix,
-    wheel_speeds,
 )
 from plants.marker_ring import SIDES, MarkerRing, add_marker_ring
+from plants.wheels import Sides, joint_matrices, servo_matrix, wheel_speeds
 from systems.angles import spatial_pose
 
 
-@dataclass
-class DifferentialDriveBody:
-    """A robot on two driven wheels.
-
-    Attributes:
-        parameters: dimensions and masses.
-        ring: markers on its four sides, for other robots to see: the first robot with such a ring
-            bears the ids 0 to 3 (front, left, back, right), the next 4 to 7, and so on.
-    """
-
-    parameters: DifferentialDriveParameters = field(default_factory=DifferentialDriveParameters)
-    ring: MarkerRing | None = None
+class WheeledBody(ABC):
+    """What all robots with two driven sides have in a station; a subclass says what they are."""
 
     @property
+    @abstractmethod
+    def sides(self) -> Sides:
+        """Its kinematics."""
+
+    @property
+    @abstractmethod
     def hull_radius(self) -> float:
         """Radius of the circle that holds the robot, m."""
-        return hull_radius(self.parameters)
 
     @property
+    @abstractmethod
     def hull(self) -> list[float]:
         """[front, rear, half_width] of the rectangle about base_link that holds the robot, m."""
-        return hull(self.parameters)
+
+    @abstractmethod
+    def add_model(self, station: StationBuilder, robot: Robot) -> None:
+        """Adds the robot to the plant, at its start."""
 
     def to_wheel_speeds(self, command: np.ndarray) -> list[float]:
         """Returns [right, left] (rad/s) of a command [v, omega]."""
-        return wheel_speeds(command.tolist(), self.parameters)
-
-    def add_model(self, station: StationBuilder, robot: Robot) -> None:
-        """Adds the robot to the plant, at its start.
-
-        Its wheels are turned by the `motor` (a `MotorModel`) of its drive, else by speed servos.
-        """
-        plant = station.plant
-        motor = getattr(robot.drive, "motor", None)
-        robot.model = add_differential_drive(plant, self.parameters, robot.name, motor)
-        body = plant.GetBodyByName("base_link", robot.model)
-        plant.SetDefaultFloatingBaseBodyPose(body, spatial_pose(robot.start))
-        if self.ring is not None:
-            station.carried_markers[robot.name] = add_marker_ring(
-                plant,
-                body,
-                self.ring,
-                family=station.marker_map.family,
-                first_id=len(SIDES) * len(station.carried_markers),
-            )
+        return wheel_speeds(command.tolist(), self.sides)
 
     def add_state(self, station: StationBuilder, robot: Robot) -> None:
         """Adds what says where the robot is and takes its wheel speeds; exports the truth."""
@@ -85,14 +65,14 @@ class DifferentialDriveBody:
                 servos.get_output_port(), plant.get_desired_state_input_port(robot.model)
             )
             robot.wheel_speeds = servos.get_input_port()
-            others = (plant.num_positions(robot.model) - 2, plant.num_velocities(robot.model) - 2)
-            # The floating body's coordinates come first, the wheels' last, the right one's before.
-            wheels = Demultiplexer([others[0], 2, others[1], 2])
-            station.add(wheels, f"{robot.name}.wheels")
-            station.connect(plant.get_state_output_port(robot.model), wheels.get_input_port())
-            robot.wheel_angles, robot.wheel_rates = (wheels.get_output_port(k) for k in (1, 3))
+            for name, matrix in zip(
+                ("wheel_angles", "wheel_rates"), joint_matrices(plant, robot.model), strict=True
+            ):
+                gain = station.add(MatrixGain(matrix), f"{robot.name}.{name}")
+                station.connect(plant.get_state_output_port(robot.model), gain.get_input_port())
+                setattr(robot, name, gain.get_output_port())
         else:
-            twin = KinematicDifferentialDrive(parameters=self.parameters)
+            twin = KinematicDifferentialDrive(parameters=self.sides)
             # Declared anew for its default value, which is where the robot starts.
             twin.DeclareContinuousState(BasicVector(robot.start))
             station.add(twin, f"{robot.name}.twin")
@@ -125,3 +105,51 @@ class DifferentialDriveBody:
         port = station.play(signal, optional=True)
         if port is not None:
             station.export_output(port, signal.port, signal)
+
+
+@dataclass
+class DifferentialDriveBody(WheeledBody):
+    """A robot on two driven wheels.
+
+    Attributes:
+        parameters: dimensions and masses.
+        ring: markers on its four sides, for other robots to see: the first robot with such a ring
+            bears the ids 0 to 3 (front, left, back, right), the next 4 to 7, and so on.
+    """
+
+    parameters: DifferentialDriveParameters = field(default_factory=DifferentialDriveParameters)
+    ring: MarkerRing | None = None
+
+    @property
+    def sides(self) -> Sides:
+        """Its kinematics."""
+        return self.parameters
+
+    @property
+    def hull_radius(self) -> float:
+        """Radius of the circle that holds the robot, m."""
+        return hull_radius(self.parameters)
+
+    @property
+    def hull(self) -> list[float]:
+        """[front, rear, half_width] of the rectangle about base_link that holds the robot, m."""
+        return hull(self.parameters)
+
+    def add_model(self, station: StationBuilder, robot: Robot) -> None:
+        """Adds the robot to the plant, at its start.
+
+        Its wheels are turned by the `motor` (a `MotorModel`) of its drive, else by speed servos.
+        """
+        plant = station.plant
+        motor = getattr(robot.drive, "motor", None)
+        robot.model = add_differential_drive(plant, self.parameters, robot.name, motor)
+        body = plant.GetBodyByName("base_link", robot.model)
+        plant.SetDefaultFloatingBaseBodyPose(body, spatial_pose(robot.start))
+        if self.ring is not None:
+            station.carried_markers[robot.name] = add_marker_ring(
+                plant,
+                body,
+                self.ring,
+                family=station.marker_map.family,
+                first_id=len(SIDES) * len(station.carried_markers),
+            )
