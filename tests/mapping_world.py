@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from plants.circuit import tag_poses
 from systems.cameras import PinholeCamera
 from systems.mapping.scene import Scene
 from systems.mapping.sightings import Sightings
@@ -82,14 +83,13 @@ def circuit(frames: int = 120, tags: int = 24, turn_deg: float = 35.0, seed: int
     p_CW = -(R_CW @ (place + 0.2 * up)[..., None])[..., 0]
 
     where, along = oval(np.linspace(0, 2 * math.pi, tags, endpoint=False))
-    across = np.cross(along, up)  # outward: the route turns left
-    away = rng.uniform(0.4, 0.9, (tags, 1))
-    height = rng.uniform(0.15, 0.45, tags)
-    p_WT = where + across * away + height[:, None] * up
-    # It looks against the route, turned toward it.
-    turn = np.radians(turn_deg)
-    normal = -along * math.cos(turn) - across * math.sin(turn)
-    R_WT = np.stack([normal, np.cross(up, normal), np.broadcast_to(up, normal.shape)], axis=2)
+    R_WT, p_WT = tag_poses(
+        where[:, :2],
+        np.arctan2(along[:, 1], along[:, 0]),
+        across=rng.uniform(0.4, 0.9, tags),  # outward: the route turns left
+        heights=rng.uniform(0.15, 0.45, tags),
+        turns=np.full(tags, np.radians(turn_deg)),
+    )
     scene = Scene(R_CW, p_CW, R_WT, p_WT)
     return Circuit(scene, _images(scene))
 

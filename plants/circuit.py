@@ -1,0 +1,467 @@
+"""Circuits with tags beside them: a closed route, and tags as a good installer puts them up.
+
+Tags stand beside the route and look against the direction of travel, turned toward the route by so
+much that they are not seen from the front, where a square's two poses are one. What the installer
+looks for is held to here: all along the route a camera on the robot has at least `in_view` tags
+that are large enough, not too tilted and not hidden, also when the robot is a little beside the
+route or askew. Where a place lacks them a tag ahead of it is put up elsewhere, and a circuit that
+still has such a place is drawn again; the seed says which random numbers come next, so one seed
+always ends with the same circuit. Tags are numbered in the order in which they come; tag 0 is in
+view at the start. Lengths are whole millimetres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydrake.geometry import Box
+from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+
+from plants.boards import PLATE_THICKNESS
+from systems.cameras import PinholeCamera
+from systems.markers.family import family
+from systems.markers.layout import Marker, MarkerMap
+from systems.markers.projector import ProjectorParameters, visible_markers
+from systems.noise import generator, stream_key
+from systems.planners.closed_curve import ClosedCurve
+from systems.raycasting import Solids
+from systems.validation import require, require_non_negative, require_positive
+
+Array = NDArray[np.float64]
+
+_DRAWS = 60  # circuits, until the parameters are given up
+_MOVES = 40  # of tags that leave as many places lacking, until a circuit is given up
+_TRIES = 30  # places for a tag, until the circuit is given up
+_LOOK = 0.05  # m between two places at which tags in view are counted
+_IN_FRONT = 1e-3  # m before a tag; what is nearer to it is its own board
+_AHEAD = (0.5, 3.5)  # m before a tag from which it may be seen
+_HARMONICS = (2, 3, 4)  # by which a route differs from a circle
+_POINTS = 16  # of a route
+
+
+@dataclass
+class CircuitCamera:
+    """What the installer thinks of the camera: an undistorted one that looks ahead.
+
+    Attributes:
+        width: px.
+        height: px.
+        focal_length: px.
+        position: [x, y, z] of the optical centre in base_link, m.
+        pitch_deg: positive looks down.
+        min_side_px: of a tag's shorter side; what looks smaller is not counted.
+        max_incidence_deg: between a tag's normal and the line of sight; more is not counted.
+        max_range: m.
+        border_px: how far inside the picture a tag has to be with its white rim.
+    """
+
+    width: int = 640
+    height: int = 480
+    focal_length: float = 448.6
+    position: list[float] = field(default_factory=lambda: [0.1, 0.0, 0.18])
+    pitch_deg: float = 0.0
+    min_side_px: float = 18.0
+    max_incidence_deg: float = 65.0
+    max_range: float = 4.0
+    border_px: float = 4.0
+
+    def __post_init__(self) -> None:
+        require(
+            len(self.position) == 3 and bool(np.isfinite(self.position).all()),
+            "position",
+            self.position,
+            "[x, y, z] in metres",
+        )
+        require(abs(self.pitch_deg) < 90, "pitch_deg", self.pitch_deg, "between -90 and 90")
+        require_positive(
+            width=self.width,
+            height=self.height,
+            focal_length=self.focal_length,
+            min_side_px=self.min_side_px,
+            max_incidence_deg=self.max_incidence_deg,
+            max_range=self.max_range,
+        )
+        require_non_negative(border_px=self.border_px)
+        require(
+            self.max_incidence_deg < 90,
+            "max_incidence_deg",
+            self.max_incidence_deg,
+            "below 90",
+        )
+
+    def model(self) -> PinholeCamera:
+        """Returns the camera."""
+        return PinholeCamera.from_focal_length(self.width, self.height, self.focal_length)
+
+    def mounting(self) -> RigidTransform:
+        """Returns `X_BC`, the pose of the optical frame in base_link."""
+        R = RollPitchYaw(0.0, math.radians(self.pitch_deg), 0.0).ToRotationMatrix()
+        forward = RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]))
+        return RigidTransform(R @ forward, self.position)
+
+    def limits(self) -> ProjectorParameters:
+        """Returns when a tag counts."""
+        return ProjectorParameters(
+            min_side_px=self.min_side_px,
+            max_incidence=math.radians(self.max_incidence_deg),
+            max_range=self.max_range,
+            border_px=self.border_px,
+        )
+
+
+@dataclass
+class CircuitParameters:
+    """What kind of circuit is drawn.
+
+    Attributes:
+        length: of the route, m.
+        waviness: how much the route's distance from its middle varies, as a part of it.
+        min_radius: of the route's curves, m.
+        tags: how many.
+        family: of the tags.
+        size: side of the black squares, m.
+        offset: [least, greatest] distance of tags from the route, m.
+        height: [least, greatest] height of the tags' centres, m.
+        turn_deg: by how much a tag that looks against the direction of travel is turned toward the
+            route.
+        turn_spread_deg: by how much that varies from tag to tag, either way.
+        inside_share: part of the tags that are on the inner side.
+        clearance: no part of a tag's board is nearer to the route, m: the robot's safe distance
+            and a margin.
+        in_view: tags that the camera has in view, at least, everywhere.
+        sway: so far the robot may be beside the route, either way, m.
+        askew_deg: so far it may be turned, either way.
+        camera: of the robot.
+    """
+
+    length: float = 15.0
+    waviness: float = 0.25
+    min_radius: float = 0.8
+    tags: int = 24
+    family: str = "36h11"
+    size: float = 0.18
+    offset: list[float] = field(default_factory=lambda: [0.55, 0.85])
+    height: list[float] = field(default_factory=lambda: [0.16, 0.45])
+    turn_deg: float = 35.0
+    turn_spread_deg: float = 5.0
+    inside_share: float = 0.2
+    clearance: float = 0.4
+    in_view: int = 2
+    sway: float = 0.05
+    askew_deg: float = 4.0
+    camera: CircuitCamera = field(default_factory=CircuitCamera)
+
+    def __post_init__(self) -> None:
+        require_positive(length=self.length, min_radius=self.min_radius, size=self.size)
+        require(0 <= self.waviness < 1, "waviness", self.waviness, "0 or more, below 1")
+        require(self.tags >= 1, "tags", self.tags, "1 or more")
+        require(0 <= self.inside_share <= 1, "inside_share", self.inside_share, "0 to 1")
+        require_non_negative(
+            clearance=self.clearance,
+            sway=self.sway,
+            askew_deg=self.askew_deg,
+            turn_spread_deg=self.turn_spread_deg,
+        )
+        require(abs(self.turn_deg) <= 180, "turn_deg", self.turn_deg, "from -180 to 180")
+        require(self.in_view >= 0, "in_view", self.in_view, "0 or more")
+        for name in ("offset", "height"):
+            value = getattr(self, name)
+            fits = len(value) == 2 and all(math.isfinite(v) and v > 0 for v in value)
+            require(fits and value[0] <= value[-1], name, value, "[least, greatest], above 0")
+        half = self.board() / 2
+        require(
+            self.height[0] >= half,
+            "height",
+            self.height,
+            f"from {half:.3g} m on, for the whole board to be over the ground",
+        )
+        kind = family(self.family)
+        require(
+            self.tags <= kind.count, "tags", self.tags, f"at most {kind.count}, as {kind.name} has"
+        )
+
+    def board(self) -> float:
+        """Returns the side of a tag's board, with its white rim, m."""
+        cells = family(self.family).cells
+        return self.size * (cells + 2) / cells
+
+
+@dataclass(frozen=True, eq=False)
+class Circuit:
+    """A circuit that was drawn.
+
+    Attributes:
+        points: (n, 2) m, through which the route goes (`ClosedCurve`), from the start on.
+        markers: the tags.
+    """
+
+    points: Array
+    markers: MarkerMap
+
+    def route(self) -> ClosedCurve:
+        """Returns the route."""
+        return ClosedCurve(self.points)
+
+    def start(self) -> Array:
+        """Returns (3,) the pose [x (m), y (m), theta (rad)] at the start."""
+        position, heading = self.route().at(0.0)
+        return np.array([*position, math.remainder(float(heading), 2 * math.pi)])
+
+
+def circuit(seed: int, parameters: CircuitParameters | None = None) -> Circuit:
+    """Draws a circuit that has `in_view` tags in view all along its route.
+
+    Args:
+        seed: any integer.
+        parameters: what kind of circuit.
+
+    Raises:
+        ValueError: there is no such circuit among many.
+    """
+    p = parameters or CircuitParameters()
+    key = stream_key(seed, "circuit")
+    for draw in range(_DRAWS):
+        random = generator(key, draw)
+        points = _draw_points(random, p)
+        route = ClosedCurve(points)
+        if np.abs(route.curvatures).max() > 1 / p.min_radius:
+            continue
+        markers = _put_up(random, route, p)
+        if markers is None:
+            continue
+        seen = seen_along(route, markers, p)
+        if seen.sum(axis=2).min() < p.in_view:  # some boards hide others
+            continue
+        numbered = _numbered(route, markers, seen[0].all(axis=0))
+        if numbered is not None:
+            return Circuit(points, numbered)
+    raise ValueError(
+        f"circuit: none of {_DRAWS} of {p.length:g} m with {p.tags} tags has {p.in_view} in view "
+        "everywhere: ask for less"
+    )
+
+
+def tag_poses(
+    positions: ArrayLike,
+    headings: ArrayLike,
+    *,
+    across: ArrayLike,
+    heights: ArrayLike,
+    turns: ArrayLike,
+) -> tuple[Array, Array]:
+    """Returns the poses of upright tags beside a route: (n, 3, 3) `R_WT` and (n, 3) `p_WT`, m.
+
+    Args:
+        positions: (n, 2) of the route, m.
+        headings: (n,) of the route there, rad.
+        across: (n,) how far to the right of it, m; negative to the left.
+        heights: (n,) m.
+        turns: (n,) by how much each is turned toward the route from looking straight against the
+            direction of travel, rad.
+    """
+    p, theta, a, z, turn = (
+        np.asarray(v, float) for v in (positions, headings, across, heights, turns)
+    )
+    ahead = np.stack([np.cos(theta), np.sin(theta)], axis=1)
+    right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
+    toward = -np.sign(a)[:, None] * right  # the route
+    normal = -ahead * np.cos(turn)[:, None] + toward * np.sin(turn)[:, None]
+    zero, one = np.zeros(len(p)), np.ones(len(p))
+    x_axis = np.column_stack([normal, zero])
+    z_axis = np.column_stack([zero, zero, one])
+    R_WT = np.stack([x_axis, np.cross(z_axis, x_axis), z_axis], axis=2)
+    return R_WT, np.column_stack([p + a[:, None] * right, z])
+
+
+def in_view(route: ClosedCurve, markers: MarkerMap, parameters: CircuitParameters) -> Array:
+    """Returns (n,) the least number of tags in view at places along a route, some cm apart.
+
+    It is the least of the robot on the route, and beside it and askew as far as it may be.
+    """
+    return seen_along(route, markers, parameters).sum(axis=2).min(axis=1)
+
+
+def seen_along(
+    route: ClosedCurve, markers: MarkerMap, parameters: CircuitParameters
+) -> NDArray[np.bool_]:
+    """Returns (n, 5, tags) which tags are in view, in the order of the map.
+
+    At n places along the route the robot is on it, left and right of it, and turned either way.
+    """
+    poses = _robot_poses(route, parameters, _LOOK)
+    seen = _seen_if_nothing_hides(poses, markers, parameters)
+    shape = seen.shape
+    seen = seen.reshape(-1, len(markers))
+    pose, tag = np.nonzero(seen)
+    X_BC = parameters.camera.mounting()
+    eyes = np.array([(X @ X_BC).translation() for X in poses.ravel()])
+    points = np.array([[*m.corners(), m.X_WM.translation()] for m in markers])  # (tags, 5, 3)
+    rays = points[tag] - eyes[pose][:, None]
+    lengths = np.linalg.norm(rays, axis=2)
+    hits = _boards(markers).first_hit(
+        np.repeat(eyes[pose], 5, axis=0),
+        (rays / lengths[..., None]).reshape(-1, 3),
+        lengths.ravel() - _IN_FRONT,
+    )
+    hidden = np.isfinite(hits).reshape(-1, 5).any(axis=1)
+    seen[pose[hidden], tag[hidden]] = False
+    return seen.reshape(shape)
+
+
+def _seen_if_nothing_hides(
+    poses: NDArray[np.object_], markers: MarkerMap, p: CircuitParameters
+) -> NDArray[np.bool_]:
+    """Returns (n, 5, tags) the same without what boards hide, all poses at once."""
+    X_BC = p.camera.mounting()
+    cameras = np.array([(X @ X_BC).inverse().GetAsMatrix34() for X in poses.ravel()])
+    X_WM, sizes = _arrays(markers)
+    R = cameras[:, None, :, :3] @ X_WM[:, :, :3]
+    place = cameras[:, None, :, :3] @ X_WM[:, :, 3:] + cameras[:, None, :, 3:]
+    found = visible_markers(
+        camera=p.camera.model(),
+        X_WC=RigidTransform(),  # the world is each camera's own frame
+        X_WM=np.concatenate([R, place], axis=3).reshape(-1, 3, 4),
+        sizes=np.tile(sizes, len(cameras)),
+        cells=markers.family.cells,
+        parameters=p.camera.limits(),
+    )
+    seen = np.zeros(len(cameras) * len(sizes), bool)
+    seen[found.index] = True
+    return seen.reshape(*poses.shape, len(sizes))
+
+
+def _robot_poses(route: ClosedCurve, p: CircuitParameters, step: float) -> NDArray[np.object_]:
+    """Returns (n, 5) `X_WB` at places along the route, `step` (m) apart."""
+    count = math.ceil(route.length / step)
+    places, headings = route.at(np.linspace(0.0, route.length, count, endpoint=False))
+    askew = math.radians(p.askew_deg)
+    sways = ((0.0, 0.0), (p.sway, 0.0), (-p.sway, 0.0), (0.0, askew), (0.0, -askew))
+    poses = np.empty((count, len(sways)), object)
+    for k, (place, heading) in enumerate(zip(places, headings, strict=True)):
+        left = np.array([-math.sin(heading), math.cos(heading)])
+        for j, (aside, turned) in enumerate(sways):
+            R_WB = RotationMatrix.MakeZRotation(float(heading + turned))
+            poses[k, j] = RigidTransform(R_WB, [*(place + aside * left), 0.0])
+    return poses
+
+
+def _arrays(markers: MarkerMap) -> tuple[Array, Array]:
+    """Returns (n, 3, 4) poses and (n,) sizes (m), in the order of the map."""
+    poses = np.array([tag.X_WM.GetAsMatrix34() for tag in markers]).reshape(-1, 3, 4)
+    return poses, np.array([tag.size for tag in markers])
+
+
+def _boards(markers: MarkerMap) -> Solids:
+    """Returns the boards, which hide what is behind them."""
+    cells = markers.family.cells
+    behind = RigidTransform([-PLATE_THICKNESS, 0.0, 0.0])  # not in the printed face itself
+    sides = [tag.size * (cells + 2) / cells for tag in markers]
+    return Solids(
+        [Box(PLATE_THICKNESS, side, side) for side in sides],
+        [tag.X_WM @ behind for tag in markers],
+    )
+
+
+def _draw_points(random: np.random.Generator, p: CircuitParameters) -> Array:
+    """Draws the points of a closed way about the origin, scaled to its length."""
+    angles = np.linspace(0, 2 * math.pi, _POINTS, endpoint=False)
+    radii = np.ones(_POINTS)
+    for m in _HARMONICS:
+        size = p.waviness * random.uniform(0.3, 1.0) / (m - 1) ** 1.5
+        radii += size * np.cos(m * angles + random.uniform(0, 2 * math.pi))
+    if random.random() < 0.5:
+        angles = -angles  # clockwise
+    points = radii[:, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    return np.asarray((points * (p.length / ClosedCurve(points).length)).round(3))
+
+
+def _put_up(
+    random: np.random.Generator, route: ClosedCurve, p: CircuitParameters
+) -> MarkerMap | None:
+    """Draws tags, and moves some until there are enough in view; None when that does not help."""
+    tags: list[Marker] = []
+    for k in range(p.tags):
+        tag = _draw_tag(random, route, p, k, tags)
+        if tag is None:
+            return None
+        tags.append(tag)
+    poses = _robot_poses(route, p, 2 * _LOOK)
+    spacing = route.length / p.tags
+
+    def missing(tags: list[Marker]) -> NDArray[np.int64]:
+        seen = _seen_if_nothing_hides(poses, _map(tags, p), p)
+        return np.maximum(p.in_view - seen.sum(axis=2).min(axis=1), 0)
+
+    lacking, idle = missing(tags), 0
+    while lacking.any() and idle < _MOVES:
+        idle += 1
+        place = random.choice(np.flatnonzero(lacking)) * 2 * _LOOK + random.uniform(
+            _AHEAD[0], _AHEAD[1]
+        )
+        k = round(place / spacing) % p.tags
+        moved = _draw_tag(random, route, p, k, [tag for tag in tags if tag.id != k])
+        if moved is None:
+            continue
+        changed = [moved if tag.id == k else tag for tag in tags]
+        now = missing(changed)
+        if now.sum() < lacking.sum():
+            idle = 0
+        if now.sum() <= lacking.sum():
+            tags, lacking = changed, now
+    return None if lacking.any() else _map(tags, p)
+
+
+def _map(tags: list[Marker], p: CircuitParameters) -> MarkerMap:
+    return MarkerMap(family(p.family), p.size, {tag.id: tag for tag in tags})
+
+
+def _draw_tag(
+    random: np.random.Generator,
+    route: ClosedCurve,
+    p: CircuitParameters,
+    k: int,
+    others: list[Marker],
+) -> Marker | None:
+    """Draws the k-th tag, clear of the route and of other tags; None when there is no place."""
+    outside = np.sign(_area(route.positions))  # 1: the right side is outside
+    half = p.board() / 2
+    for _ in range(_TRIES):
+        side = outside * (-1 if random.random() < p.inside_share else 1)
+        position, heading = route.at([(k + random.uniform(-0.4, 0.4)) * route.length / p.tags])
+        turn = p.turn_deg + random.uniform(-1, 1) * p.turn_spread_deg
+        R, place = tag_poses(
+            position,
+            heading,
+            across=[side * random.uniform(p.offset[0], p.offset[1])],
+            heights=[random.uniform(p.height[0], p.height[1])],
+            turns=[math.radians(turn)],
+        )
+        facing = round(math.degrees(math.atan2(R[0, 1, 0], R[0, 0, 0])), 1)
+        X = RigidTransform(RollPitchYaw(0.0, 0.0, math.radians(facing)), place[0].round(3))
+        middle = X.translation()[:2]
+        ends = middle + half * np.outer([-1, 1], X.rotation().matrix()[:2, 1])
+        gaps = np.array([np.hypot(*(o.X_WM.translation()[:2] - middle)) for o in others])
+        if route.distances(ends).min() >= p.clearance and (gaps > 3 * half).all():
+            return Marker(k, X, p.size)
+    return None
+
+
+def _area(polygon: Array) -> float:
+    x, y = polygon.T
+    return float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2
+
+
+def _numbered(
+    route: ClosedCurve, markers: MarkerMap, from_start: NDArray[np.bool_]
+) -> MarkerMap | None:
+    """Returns the tags numbered as they come, the nearest of those `from_start` first."""
+    if not from_start.any():
+        return None
+    tags = list(markers)
+    away = [np.hypot(*(tag.X_WM.translation()[:2] - route.positions[0])) for tag in tags]
+    first = int(np.argmin(np.where(from_start, away, np.inf)))
+    ordered = tags[first:] + tags[:first]
+    return replace(markers, markers={k: replace(tag, id=k) for k, tag in enumerate(ordered)})
