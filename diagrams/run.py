@@ -39,6 +39,8 @@ RESULTS = (
     "calibration.json",
     "estimate_chain.tum",
     "moves.json",
+    "*_camera.tum",
+    "anchor.json",
 )
 
 # s, of the integrator; only kinematic twins have continuous state. Steps end at every event, and at
@@ -77,7 +79,8 @@ def simulate(
         scenario: as `load_scenario` gives it.
         out: folder of the results; None writes nothing. An earlier run's results are replaced.
         meshcat: where it is shown; its replay is written too.
-        realtime: slows the simulation down to this many times real time; 0 is as fast as it goes.
+        realtime: slows the simulation down to this many times real time; 0 is as fast as it goes,
+            or as the scenario wants it.
         progress: called with the simulated time and the duration, s.
 
     Raises:
@@ -97,7 +100,9 @@ def simulate(
     prepare()  # or the first pictures would wait for the compiler
     gc.freeze()  # diagram and modules stay: to look through them again and again costs 5 %
     try:
-        outcome, context, wall = _advance(scenario, mission, realtime, progress)
+        outcome, context, wall = _advance(
+            scenario, mission, realtime or scenario.realtime_rate, progress
+        )
     finally:
         gc.unfreeze()
         if mission.recorder is not None:

@@ -38,6 +38,8 @@ MISSIONS = Table(
         "formation": "diagrams.formation:FormationScenario",
         "navigation": "diagrams.navigation:NavigationScenario",
         "snailbot": "diagrams.snailbot:SnailBotScenario",
+        "tag_frames": "diagrams.tag_frames:TagFramesScenario",
+        "teach": "diagrams.teach:TeachScenario",
     },
     method="build",
 )
@@ -97,6 +99,11 @@ class Scenario:
     def time_limit(self) -> float:
         """When the run ends at the latest, s."""
         return self.duration
+
+    @property
+    def realtime_rate(self) -> float:
+        """How many times real time the run is held to, unless it is told; 0: as fast as it goes."""
+        return 0.0
 
 
 @dataclass

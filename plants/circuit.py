@@ -4,7 +4,8 @@ Tags stand beside the route and look against the direction of travel, turned tow
 much that they are not seen from the front, where a square's two poses are one. What the installer
 looks for is held to here: all along the route a camera on the robot has at least `in_view` tags
 that are large enough, not too tilted and not hidden, also when the robot is a little beside the
-route or askew. Where a place lacks them a tag ahead of it is put up elsewhere, and a circuit that
+route or askew; and every tag is in view for half a metre at least. Where a place lacks tags one
+ahead of it is put up elsewhere, and a circuit that
 still has such a place is drawn again; the seed says which random numbers come next, so one seed
 always ends with the same circuit. Tags are numbered in the order in which they come; tag 0 is in
 view at the start. Lengths are whole millimetres.
@@ -36,6 +37,8 @@ _DRAWS = 60  # circuits, until the parameters are given up
 _MOVES = 40  # of tags that leave as many places lacking, until a circuit is given up
 _TRIES = 30  # places for a tag, until the circuit is given up
 _LOOK = 0.05  # m between two places at which tags in view are counted
+_HIDDEN = 1000  # how much more is lacking while it is for other reasons than what boards hide
+_SEEN = 0.5  # m of the route, along which a tag is in view at least
 _IN_FRONT = 1e-3  # m before a tag; what is nearer to it is its own board
 _AHEAD = (0.5, 3.5)  # m before a tag from which it may be seen
 _HARMONICS = (2, 3, 4)  # by which a route differs from a circle
@@ -232,10 +235,8 @@ def circuit(seed: int, parameters: CircuitParameters | None = None) -> Circuit:
         markers = _put_up(random, route, p)
         if markers is None:
             continue
-        seen = seen_along(route, markers, p)
-        if seen.sum(axis=2).min() < p.in_view:  # some boards hide others
-            continue
-        numbered = _numbered(route, markers, seen[0].all(axis=0))
+        from_start = seen_along(route, markers, p)[0].all(axis=0)
+        numbered = _numbered(route, markers, from_start)
         if numbered is not None:
             return Circuit(points, numbered)
     raise ValueError(
@@ -291,61 +292,69 @@ def seen_along(
 
     At n places along the route the robot is on it, left and right of it, and turned either way.
     """
-    poses = _robot_poses(route, parameters, _LOOK)
-    seen = _seen_if_nothing_hides(poses, markers, parameters)
-    shape = seen.shape
-    seen = seen.reshape(-1, len(markers))
-    pose, tag = np.nonzero(seen)
-    X_BC = parameters.camera.mounting()
-    eyes = np.array([(X @ X_BC).translation() for X in poses.ravel()])
-    points = np.array([[*m.corners(), m.X_WM.translation()] for m in markers])  # (tags, 5, 3)
-    rays = points[tag] - eyes[pose][:, None]
-    lengths = np.linalg.norm(rays, axis=2)
-    hits = _boards(markers).first_hit(
-        np.repeat(eyes[pose], 5, axis=0),
-        (rays / lengths[..., None]).reshape(-1, 3),
-        lengths.ravel() - _IN_FRONT,
-    )
-    hidden = np.isfinite(hits).reshape(-1, 5).any(axis=1)
-    seen[pose[hidden], tag[hidden]] = False
-    return seen.reshape(shape)
+    return _seen(_views(route, parameters, _LOOK), markers, parameters, hiding=True)
 
 
-def _seen_if_nothing_hides(
-    poses: NDArray[np.object_], markers: MarkerMap, p: CircuitParameters
-) -> NDArray[np.bool_]:
-    """Returns (n, 5, tags) the same without what boards hide, all poses at once."""
-    X_BC = p.camera.mounting()
-    cameras = np.array([(X @ X_BC).inverse().GetAsMatrix34() for X in poses.ravel()])
-    X_WM, sizes = _arrays(markers)
-    R = cameras[:, None, :, :3] @ X_WM[:, :, :3]
-    place = cameras[:, None, :, :3] @ X_WM[:, :, 3:] + cameras[:, None, :, 3:]
-    found = visible_markers(
-        camera=p.camera.model(),
-        X_WC=RigidTransform(),  # the world is each camera's own frame
-        X_WM=np.concatenate([R, place], axis=3).reshape(-1, 3, 4),
-        sizes=np.tile(sizes, len(cameras)),
-        cells=markers.family.cells,
-        parameters=p.camera.limits(),
-    )
-    seen = np.zeros(len(cameras) * len(sizes), bool)
-    seen[found.index] = True
-    return seen.reshape(*poses.shape, len(sizes))
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """Cameras at places along a route: `R_CW` (n, 5, 3, 3) and `p_WC` (n, 5, 3) m."""
+
+    R_CW: Array
+    p_WC: Array
 
 
-def _robot_poses(route: ClosedCurve, p: CircuitParameters, step: float) -> NDArray[np.object_]:
-    """Returns (n, 5) `X_WB` at places along the route, `step` (m) apart."""
+def _views(route: ClosedCurve, p: CircuitParameters, step: float) -> _Views:
+    """Returns the cameras of robots on the route, left and right of it, and turned either way."""
     count = math.ceil(route.length / step)
     places, headings = route.at(np.linspace(0.0, route.length, count, endpoint=False))
     askew = math.radians(p.askew_deg)
-    sways = ((0.0, 0.0), (p.sway, 0.0), (-p.sway, 0.0), (0.0, askew), (0.0, -askew))
-    poses = np.empty((count, len(sways)), object)
-    for k, (place, heading) in enumerate(zip(places, headings, strict=True)):
-        left = np.array([-math.sin(heading), math.cos(heading)])
-        for j, (aside, turned) in enumerate(sways):
-            R_WB = RotationMatrix.MakeZRotation(float(heading + turned))
-            poses[k, j] = RigidTransform(R_WB, [*(place + aside * left), 0.0])
-    return poses
+    asides = np.array([0.0, p.sway, -p.sway, 0.0, 0.0])
+    theta = headings[:, None] + [0.0, 0.0, 0.0, askew, -askew]
+    left = np.stack([-np.sin(headings), np.cos(headings)], axis=1)
+    p_WB = np.zeros((*theta.shape, 3))
+    p_WB[..., :2] = places[:, None] + asides[:, None] * left[:, None]
+    R_WB = np.zeros((*theta.shape, 3, 3))
+    R_WB[..., 0, 0] = R_WB[..., 1, 1] = np.cos(theta)
+    R_WB[..., 1, 0], R_WB[..., 0, 1] = np.sin(theta), -np.sin(theta)
+    R_WB[..., 2, 2] = 1.0
+    X_BC = p.camera.mounting()
+    R_WC = R_WB @ X_BC.rotation().matrix()
+    return _Views(R_WC.swapaxes(-1, -2), p_WB + R_WB @ X_BC.translation())
+
+
+def _seen(
+    views: _Views, markers: MarkerMap, p: CircuitParameters, *, hiding: bool
+) -> NDArray[np.bool_]:
+    """Returns (n, 5, tags) which tags are in view, all at once; boards may hide others."""
+    shape = views.p_WC.shape[:2]
+    R_CW, p_WC = views.R_CW.reshape(-1, 1, 3, 3), views.p_WC.reshape(-1, 3)
+    X_WM, sizes = _arrays(markers)
+    X_CM = np.empty((len(p_WC), len(sizes), 3, 4))
+    X_CM[..., :3] = R_CW @ X_WM[:, :, :3]
+    X_CM[..., 3] = (R_CW @ (X_WM[:, :, 3] - p_WC[:, None])[..., None])[..., 0]
+    found = visible_markers(
+        camera=p.camera.model(),
+        X_WC=RigidTransform(),  # the world is each camera's own frame
+        X_WM=X_CM.reshape(-1, 3, 4),
+        sizes=np.tile(sizes, len(p_WC)),
+        cells=markers.family.cells,
+        parameters=p.camera.limits(),
+    )
+    view, tag = np.divmod(found.index, len(sizes))
+    if hiding:
+        points = np.array([[*m.corners(), m.X_WM.translation()] for m in markers])  # (tags, 5, 3)
+        rays = points[tag] - p_WC[view][:, None]
+        lengths = np.linalg.norm(rays, axis=2)
+        hits = _boards(markers).first_hit(
+            np.repeat(p_WC[view], 5, axis=0),
+            (rays / lengths[..., None]).reshape(-1, 3),
+            lengths.ravel() - _IN_FRONT,
+        )
+        free = ~np.isfinite(hits).reshape(-1, 5).any(axis=1)
+        view, tag = view[free], tag[free]
+    seen = np.zeros((len(p_WC), len(sizes)), bool)
+    seen[view, tag] = True
+    return seen.reshape(*shape, len(sizes))
 
 
 def _arrays(markers: MarkerMap) -> tuple[Array, Array]:
@@ -388,30 +397,43 @@ def _put_up(
         if tag is None:
             return None
         tags.append(tag)
-    poses = _robot_poses(route, p, 2 * _LOOK)
-    spacing = route.length / p.tags
+    coarse, fine = _views(route, p, 2 * _LOOK), _views(route, p, _LOOK)
 
-    def missing(tags: list[Marker]) -> NDArray[np.int64]:
-        seen = _seen_if_nothing_hides(poses, _map(tags, p), p)
-        return np.maximum(p.in_view - seen.sum(axis=2).min(axis=1), 0)
+    def lacks(tags: list[Marker]) -> tuple[int, list[int], list[float]]:
+        """How much is lacking, which tags are seen too little, and the ways (m) of poor places."""
+        # Where some are hidden matters, and costs time, only when all else is well.
+        for views, step, hiding in ((coarse, 2 * _LOOK, False), (fine, _LOOK, True)):
+            seen = _seen(views, _map(tags, p), p, hiding=hiding)
+            places = np.maximum(p.in_view - seen.sum(axis=2).min(axis=1), 0)
+            useless = np.flatnonzero(_seen_for(seen, step) < _SEEN).tolist()
+            if lacking := int(places.sum() * step / _LOOK) + len(useless):
+                break
+        more = 0 if hiding or not lacking else _HIDDEN
+        return lacking + more, useless, (np.flatnonzero(places) * step).tolist()
 
-    lacking, idle = missing(tags), 0
-    while lacking.any() and idle < _MOVES:
-        idle += 1
-        place = random.choice(np.flatnonzero(lacking)) * 2 * _LOOK + random.uniform(
-            _AHEAD[0], _AHEAD[1]
-        )
-        k = round(place / spacing) % p.tags
+    (lacking, useless, ways), tries = lacks(tags), 0
+    while lacking and tries < _MOVES:
+        tries += 1
+        if useless:
+            k = tags[random.choice(useless)].id
+        else:
+            ahead = random.uniform(_AHEAD[0], _AHEAD[1])
+            k = round((random.choice(ways) + ahead) / route.length * p.tags) % p.tags
         moved = _draw_tag(random, route, p, k, [tag for tag in tags if tag.id != k])
         if moved is None:
             continue
         changed = [moved if tag.id == k else tag for tag in tags]
-        now = missing(changed)
-        if now.sum() < lacking.sum():
-            idle = 0
-        if now.sum() <= lacking.sum():
-            tags, lacking = changed, now
-    return None if lacking.any() else _map(tags, p)
+        now = lacks(changed)
+        if now[0] < lacking:
+            tries = 0
+        if now[0] <= lacking:
+            tags, (lacking, useless, ways) = changed, now
+    return _map(tags, p) if lacking == 0 else None
+
+
+def _seen_for(seen: NDArray[np.bool_], step: float) -> Array:
+    """Returns (tags,) along how much of the route each is in view however the robot sways, m."""
+    return np.asarray(seen.all(axis=1).sum(axis=0) * step, np.float64)
 
 
 def _map(tags: list[Marker], p: CircuitParameters) -> MarkerMap:

@@ -154,6 +154,42 @@ def planar_estimate_from_ros(message: Any) -> tuple[Array, Array]:
     return np.array([position.x, position.y, theta]), covariance[_PLANAR]
 
 
+def odometry_to_ros(
+    pose: Array,
+    covariance: Array,
+    velocity: Array,
+    *,
+    stamp: float,
+    frame_id: str = "odom",
+    child_frame_id: str = "base_link",
+) -> Any:
+    """Returns `nav_msgs/msg/Odometry` of planar odometry.
+
+    Args:
+        pose: (3,) [x (m), y (m), theta (rad)] of the child in the frame.
+        covariance: (3, 3) in that order.
+        velocity: (2,) [v (m/s), omega (rad/s)] in the child's axes. Its covariance is told as
+            unknown (zeros).
+        stamp: s.
+        frame_id: the frame that the pose is in.
+        child_frame_id: whose pose it is.
+    """
+    estimate = planar_estimate_to_ros(pose, covariance, stamp=stamp, frame_id=frame_id)
+    return message_class("nav_msgs/msg/Odometry")(
+        estimate.header,
+        child_frame_id,
+        estimate.pose,
+        message_class("geometry_msgs/msg/TwistWithCovariance")(
+            command_to_ros(velocity), np.zeros(36)
+        ),
+    )
+
+
+def odometry_from_ros(message: Any) -> tuple[Array, Array, Array]:
+    """Returns pose (3,), its covariance (3, 3) and velocity (2,) of planar odometry."""
+    return *planar_estimate_from_ros(message), command_from_ros(message.twist)
+
+
 def pose_to_ros(pose: RigidTransform, *, stamp: float, frame_id: str) -> Any:
     """Returns `geometry_msgs/msg/PoseStamped`."""
     return message_class("geometry_msgs/msg/PoseStamped")(header(stamp, frame_id), _pose(pose))
