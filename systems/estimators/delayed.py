@@ -64,11 +64,13 @@ class Memory:
             k: number of the tick.
             x: (6,) state at its beginning; counts only if there is no older tick to go back to.
             P: (6, 6).
-            drive: its speed; its yaw rate is what is expected until `measure_yaw_rate`.
+            drive: its speed; its yaw rate is what is expected until `measure_yaw_rate`, and until
+                then its turn variance counts.
         """
         row = self._row(k)
         row[:_POSES.start] = (
-            k, drive.speed, drive.speed_variance, drive.yaw_rate, np.nan, 0.0, np.nan, 0.0,
+            k, drive.speed, drive.speed_variance, drive.yaw_rate, np.nan, drive.turn_variance,
+            np.nan, 0.0,
         )  # fmt: skip
         row[_X] = x
         row[_P] = P.ravel()
@@ -179,9 +181,11 @@ class Memory:
         return row
 
     def _mean_drive(self, first: int, last: int, offset: float, weight: float) -> Drive:
-        rows = [self._row(k)[_SPEED : _EXPECTED + 1].tolist() for k in range(first, last + 1)]
-        speed, variance, expected = (sum(column) / len(rows) for column in zip(*rows, strict=True))
-        return Drive(speed, expected + offset, variance, 0.0, weight)
+        rows = [self._row(k)[_SPEED:_STAMP].tolist() for k in range(first, last + 1)]
+        speed, variance, expected, _, turn_variance = (
+            sum(column) / len(rows) for column in zip(*rows, strict=True)
+        )
+        return Drive(speed, expected + offset, variance, turn_variance, weight)
 
     def _measurements(self, first: int, last: int) -> list[Measurement]:
         """Returns those of pictures taken in these ticks, the newest first."""

@@ -268,6 +268,7 @@ class PlanarEkf(LeafSystem):
     ) -> Drive:
         """Returns speed and expected turn rate over the tick that begins."""
         p, dt = self._parameters, 1.0 / self._rate
+        turning = p.yaw_rate_change**2 * dt
         command = self._command_input.Eval(context).tolist()
         variance = 0.0
         if not all(map(math.isfinite, command)):
@@ -280,9 +281,9 @@ class PlanarEkf(LeafSystem):
         if self._wheel_speeds_input.HasValue(context):
             measured = p.wheel_radius * float(np.mean(self._wheel_speeds_input.Eval(context)))
             if math.isfinite(measured):
-                return Drive(measured, turn_rate)
+                return Drive(measured, turn_rate, 0.0, turning)
             counts["bad_wheel_speeds"] += 1
-        return Drive(speed, turn_rate, variance)
+        return Drive(speed, turn_rate, variance, turning)
 
     def _measure_yaw_rate(
         self, context: Context, memory: Memory, k: int, counts: Counter[str]

@@ -42,6 +42,8 @@ class PlanarEkfParameters:
         gyro_delay: how old a yaw rate is when the filter looks at it, s, in whole ticks. It tells
             of the tick that ended then. A block that samples at the filter's rate is heard of one
             tick later.
+        yaw_rate_change: how far the yaw rate may be from what the last sample and the commands
+            foretell, rad/s, until the gyro has been heard: on wheels that slip sideways.
         lost_speed_noise: `speed_noise` while commands are not finite.
         lost_turn_noise: random walk of the heading while the gyro fails and the commanded turn rate
             stands in, rad/sqrt(s).
@@ -76,6 +78,7 @@ class PlanarEkfParameters:
     gyro_scale_walk: float = 1e-4
     gyro_range: float = 35.0
     gyro_delay: float = 0.01
+    yaw_rate_change: float = 0.0
     lost_speed_noise: float = 0.1
     lost_turn_noise: float = 0.3
     measurement_floor: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
@@ -90,7 +93,7 @@ class PlanarEkfParameters:
         zero_allowed = (
             "speed_noise", "slip_noise", "side_noise", "scale_walk", "speed_lag", "gyro_noise",
             "turn_noise", "gyro_bias_walk", "gyro_delay", "gyro_scale_std",
-            "gyro_scale_walk", "lost_speed_noise", "lost_turn_noise",
+            "gyro_scale_walk", "yaw_rate_change", "lost_speed_noise", "lost_turn_noise",
             "stamp_noise",
         )  # fmt: skip
         require_non_negative(**{name: getattr(self, name) for name in zero_allowed})

@@ -798,3 +798,14 @@ def test_nonsense_is_refused(field: str, value: Any) -> None:
 def test_a_rate_of_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match=r"rate is 0\.0: must be greater than 0"):
         PlanarEkf(rate=0.0)
+
+
+def test_what_the_gyro_has_not_told_of_yet_widens_the_heading_until_it_has() -> None:
+    log = drive(arcs(5.0, 3), 3)
+    parameters = [PlanarEkfParameters(gyro_delay=0.02, yaw_rate_change=c) for c in (0.0, 0.3)]
+    still, jerky = listen(log, *(PlanarEkf(parameters=p) for p in parameters))
+    # Three ticks of 10 ms: the delay's two and the one that is foretold.
+    more = jerky.covariance[-100:, 2, 2] - still.covariance[-100:, 2, 2]
+    np.testing.assert_allclose(more, 3 * (0.3 * 0.01) ** 2, rtol=0.1)
+    # What has been heard of leaves nothing behind.
+    np.testing.assert_allclose(jerky.pose[-100:], still.pose[-100:], atol=1e-3)
