@@ -73,11 +73,16 @@ from systems.avoiders.vfh_plus import VfhPlus
 from systems.cameras import PinholeCamera
 from systems.controllers.collision_monitor import CollisionMonitor
 from systems.controllers.formation_cameras import FormationCameras
+from systems.controllers.kanayama import Kanayama
+from systems.controllers.mpc import Mpc
+from systems.controllers.pure_pursuit import PurePursuit
 from systems.controllers.search import SearchWhenLost
 from systems.controllers.shell_route import Leg, ShellRoute
 from systems.controllers.step_task import StepTask
 from systems.controllers.triangle_algorithm1 import TriangleAlgorithm1
 from systems.controllers.triangle_resection import TriangleResection
+from systems.controllers.tvlqr import Tvlqr
+from systems.controllers.unicycle import Unicycle
 from systems.controllers.waypoints import WaypointController
 from systems.controllers.wheel_drive import WheelDrive
 from systems.controllers.wheel_pwm import WheelPwm
@@ -130,6 +135,7 @@ from systems.planners.formation_planner import FormationPlanner
 from systems.planners.formation_turns import FormationTurns
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor
+from systems.planners.route import Route
 from systems.planners.sonar_obstacles import SonarObstacles
 from systems.planners.waypoint_sequencer import WaypointSequencer
 from systems.pose_vector import PoseFromVector, PoseToVector
@@ -382,6 +388,17 @@ def formation_step(kind: type) -> Case:
 FORMATION_OPTIONS = {TriangleAlgorithm1: {"parameters": Algorithm1Parameters(dt=70.0)}}
 
 
+def tracker(kind: type) -> Case:
+    t = 0.1 * np.arange(20)
+    one, none = np.ones(20), np.zeros(20)
+    system = kind(route=Route(t, 0.3 * t, none, none, 0.3 * one, none))
+    covariances = (1e-4 * np.eye(3).ravel(), 1e6 * np.eye(3).ravel())
+    return Case(
+        system,
+        {"pose": vector(0.1, 0.02, 0.1), "covariance": covariances, "sent": vector(0.2, 0.1)},
+    )
+
+
 CASES: dict[type, Callable[[Path], Case]] = {
     AStarPlanner: lambda _: Case(
         AStarPlanner(),
@@ -510,6 +527,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
         KnownShellMotion(),
         {"pose": POSES, "spatial_velocity": vector(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)},
     ),
+    Kanayama: lambda _: tracker(Kanayama),
     KinematicDifferentialDrive: lambda _: Case(
         KinematicDifferentialDrive(), {"wheel_speeds": vector(3.0, 5.0)}
     ),
@@ -570,6 +588,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "imu": vector(0.1, 0.2, 0.3, 0.0, 0.0, 9.81),
         },
     ),
+    Mpc: lambda _: tracker(Mpc),
     MovingObstacles: lambda _: Case(
         MovingObstacles(
             cylinders=[MovingCylinder(radius=0.1, path=[[0, 0], [1, 0]], speed=0.3, courtesy=0.5)],
@@ -740,6 +759,9 @@ CASES: dict[type, Callable[[Path], Case]] = {
             entries=[Entry(round(1e8 * k), 0.1 * k, np.full(3, k)) for k in range(5)], size=3
         )
     ),
+    PurePursuit: lambda _: tracker(PurePursuit),
+    Tvlqr: lambda _: tracker(Tvlqr),
+    Unicycle: lambda _: Case(Unicycle(), {"command": vector(0.3, 0.2)}),
     VfhPlus: lambda _: avoider(VfhPlus),
     WaypointController: lambda _: Case(
         WaypointController(), {"pose": vector(0.0, 0.0, 0.3), "goal": vector(0.1, 0.1)}
