@@ -75,7 +75,9 @@ from systems.controllers.collision_monitor import CollisionMonitor
 from systems.controllers.formation_cameras import FormationCameras
 from systems.controllers.kanayama import Kanayama
 from systems.controllers.mpc import Mpc
+from systems.controllers.path_tracking import TrackingState
 from systems.controllers.pure_pursuit import PurePursuit
+from systems.controllers.replay_supervisor import ReplaySupervisor
 from systems.controllers.search import SearchWhenLost
 from systems.controllers.shell_route import Leg, ShellRoute
 from systems.controllers.step_task import StepTask
@@ -116,6 +118,7 @@ from systems.messages import (
     AvoiderState,
     CameraImage,
     Detections,
+    Health,
     Message,
     OccupancyGrid,
     PointMatches,
@@ -136,6 +139,7 @@ from systems.planners.formation_turns import FormationTurns
 from systems.planners.occupancy import OccupancyMapper
 from systems.planners.progress import ProgressMonitor
 from systems.planners.route import Route
+from systems.planners.route_clearance import RouteClearance
 from systems.planners.sonar_obstacles import SonarObstacles
 from systems.planners.waypoint_sequencer import WaypointSequencer
 from systems.pose_vector import PoseFromVector, PoseToVector
@@ -388,10 +392,14 @@ def formation_step(kind: type) -> Case:
 FORMATION_OPTIONS = {TriangleAlgorithm1: {"parameters": Algorithm1Parameters(dt=70.0)}}
 
 
-def tracker(kind: type) -> Case:
+def straight_route() -> Route:
     t = 0.1 * np.arange(20)
     one, none = np.ones(20), np.zeros(20)
-    system = kind(route=Route(t, 0.3 * t, none, none, 0.3 * one, none))
+    return Route(t, 0.3 * t, none, none, 0.3 * one, none)
+
+
+def tracker(kind: type) -> Case:
+    system = kind(route=straight_route())
     covariances = (1e-4 * np.eye(3).ravel(), 1e6 * np.eye(3).ravel())
     return Case(
         system,
@@ -709,6 +717,25 @@ CASES: dict[type, Callable[[Path], Case]] = {
     SphereFlow: lambda _: Case(
         SphereFlow(estimator=SphereFlowEstimator(view=VIEW)),
         {"matches": (matches(1.0, 1e-4), matches(2.0, 2e-4))},
+    ),
+    ReplaySupervisor: lambda _: Case(
+        ReplaySupervisor(),
+        {
+            "command": vector(0.3, 0.1),
+            "covariance": (1e-6 * np.eye(3).ravel(), 1e-2 * np.eye(3).ravel()),
+            "estimator_health": (Health({"accepted": 1}), Health({"accepted": 2, "restarted": 1})),
+            "tracking": (TrackingState(distance=0.0), TrackingState(distance=1.0)),
+            "free_distance": vector(0.3),
+        },
+    ),
+    RouteClearance: lambda _: Case(
+        RouteClearance(route=straight_route()),
+        {
+            "pose": vector(0.0, 0.0, 0.0),
+            "scan": (turn(0.1, 0.4), turn(0.1, 0.3)),
+            "tracking": (TrackingState(run=0.0), TrackingState(run=0.2)),
+        },
+        nan_outputs=("free_distance",),
     ),
     ShellEkf: lambda _: Case(
         ShellEkf(view=VIEW, marker_map=MAP),
