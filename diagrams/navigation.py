@@ -318,7 +318,7 @@ def _show(wiring: Wiring, scenario: NavigationScenario, meshcat: Meshcat, has_tr
     wiring.add(
         EstimateViewer(
             meshcat=meshcat,
-            body=scenario.robot.body.build().parameters,
+            ghost=scenario.robot.body.build().ghost(),
             waypoints=np.array(scenario.waypoints),
             radius=scenario.arrival_radius,
             rate=FRAME_RATE,

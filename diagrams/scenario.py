@@ -37,6 +37,7 @@ MISSIONS = Table(
     {
         "formation": "diagrams.formation:FormationScenario",
         "navigation": "diagrams.navigation:NavigationScenario",
+        "replay": "diagrams.replay:ReplayScenario",
         "snailbot": "diagrams.snailbot:SnailBotScenario",
         "tag_frames": "diagrams.tag_frames:TagFramesScenario",
         "teach": "diagrams.teach:TeachScenario",

@@ -19,10 +19,10 @@ from systems.estimators.madgwick import Madgwick
 from systems.estimators.reference_motion import CarriedShellMotion, KnownShellMotion
 from systems.flow.mean_flow import MeanFlow
 from systems.flow.sphere_flow import SphereFlow, SphereFlowEstimator
+from systems.markers.markers_seen import MarkersSeen
 from systems.pose_vector import PoseFromVector, PoseToVector
 from systems.sensors.pose_outliers import PoseOutliers
 from systems.shell.marker_pose import ShellMarkerPose, shell_localizer
-from systems.shell.markers_seen import MarkersSeen
 
 if TYPE_CHECKING:
     from diagrams.snailbot import SnailBotScenario

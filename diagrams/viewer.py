@@ -6,13 +6,14 @@ scaled, and the paths are marks that appear one after the other.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Sphere
+from pydrake.geometry import Box, Cylinder, Meshcat, Rgba, Shape, Sphere
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, InputPort, LeafSystem
 
-from plants.differential_drive import DifferentialDriveParameters
 from systems.angles import spatial_pose
 
 Array = NDArray[np.float64]
@@ -31,6 +32,50 @@ def ellipse(covariance: Array) -> tuple[float, float, float]:
     return float(a), float(b), float(np.arctan2(vectors[1, 1], vectors[0, 1]))
 
 
+class Ghost(NamedTuple):
+    """How a robot looks where it believes to be.
+
+    Attributes:
+        parts: name to shape and its pose in base_link.
+        height: of the robot, m.
+    """
+
+    parts: dict[str, tuple[Shape, RigidTransform]]
+    height: float
+
+
+def ghost_of(
+    *,
+    length: float,
+    width: float,
+    clearance: float,
+    height: float,
+    wheels: dict[str, tuple[float, float]],
+    wheel_radius: float,
+    wheel_width: float,
+) -> Ghost:
+    """Returns the ghost of a box on wheels.
+
+    Args:
+        length: of the box, m.
+        width: m.
+        clearance: from the ground to the box, m.
+        height: from the ground to its top, m.
+        wheels: name to [x, y] of the wheel's middle in base_link, m.
+        wheel_radius: m.
+        wheel_width: m.
+    """
+    middle = RigidTransform([0.0, 0.0, (clearance + height) / 2])
+    parts: dict[str, tuple[Shape, RigidTransform]] = {
+        "chassis": (Box(length, width, height - clearance), middle)
+    }
+    upright = RollPitchYaw(np.pi / 2, 0.0, 0.0)
+    for name, (x, y) in wheels.items():
+        wheel = Cylinder(wheel_radius, wheel_width)
+        parts[name] = wheel, RigidTransform(upright, [x, y, wheel_radius])
+    return Ghost(parts, height)
+
+
 class EstimateViewer(LeafSystem):
     """Shows the estimated pose as a ghost of the robot, with its 95 % ellipse and both paths.
 
@@ -44,7 +89,7 @@ class EstimateViewer(LeafSystem):
 
     Args:
         meshcat: where.
-        body: dimensions of the ghost.
+        ghost: how the robot looks.
         waypoints: (n, 2) m, shown as posts with discs of the arrival radius.
         radius: arrival radius, m.
         rate: pictures a second, Hz.
@@ -62,7 +107,7 @@ class EstimateViewer(LeafSystem):
         self,
         *,
         meshcat: Meshcat,
-        body: DifferentialDriveParameters,
+        ghost: Ghost,
         waypoints: Array,
         radius: float,
         rate: float,
@@ -77,8 +122,8 @@ class EstimateViewer(LeafSystem):
         # Where the last mark of each path was drawn: what the browser holds, not the diagram.
         self._last: dict[str, Array] = {}
         self._count = {"estimate": 0, "truth": 0}
-        self._top = body.clearance + body.height + _ABOVE
-        self._draw_ghost(body)
+        self._top = ghost.height + _ABOVE
+        self._draw_ghost(ghost)
         self._draw_waypoints(waypoints, radius)
         meshcat.SetObject(f"{_ROOT}/ellipse/disc", Cylinder(1.0, 0.002), Rgba(1.0, 0.85, 0.1, 0.9))
         self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
@@ -95,19 +140,11 @@ class EstimateViewer(LeafSystem):
         """Returns the port of the true pose."""
         return self._truth_input
 
-    def _draw_ghost(self, body: DifferentialDriveParameters) -> None:
-        ghost = Rgba(0.9, 0.2, 0.2, 0.35)
-        middle = body.clearance + body.height / 2
-        chassis = Box(body.length, body.width, body.height)
-        self._meshcat.SetObject(f"{_ROOT}/estimate/chassis", chassis, ghost)
-        self._meshcat.SetTransform(f"{_ROOT}/estimate/chassis", RigidTransform([0.0, 0.0, middle]))
-        for side, y in (("right", -1), ("left", 1)):
-            name = f"{_ROOT}/estimate/{side}_wheel"
-            self._meshcat.SetObject(name, Cylinder(body.wheel_radius, body.wheel_width), ghost)
-            X_BWheel = RigidTransform(
-                RollPitchYaw(np.pi / 2, 0.0, 0.0), [0.0, y * body.base / 2, body.wheel_radius]
-            )
-            self._meshcat.SetTransform(name, X_BWheel)
+    def _draw_ghost(self, ghost: Ghost) -> None:
+        for name, (shape, X_BG) in ghost.parts.items():
+            path = f"{_ROOT}/estimate/{name}"
+            self._meshcat.SetObject(path, shape, Rgba(0.9, 0.2, 0.2, 0.35))
+            self._meshcat.SetTransform(path, X_BG)
 
     def _draw_waypoints(self, waypoints: Array, radius: float) -> None:
         for k, (x, y) in enumerate(waypoints):

@@ -44,6 +44,7 @@ from ruamel.yaml import YAML
 import diagrams
 import plants
 import systems
+from diagrams.drivers.body import DifferentialDriveBody
 from diagrams.formation_viewer import FormationViewer
 from diagrams.shell_viewer import ShellViewer
 from diagrams.surroundings_viewer import SurroundingsViewer
@@ -113,6 +114,7 @@ from systems.markers.detector import Detector, MarkerDetector
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap
 from systems.markers.localizer import Localizer, LocalizerParameters, MapLocalizer
+from systems.markers.markers_seen import MarkersSeen
 from systems.markers.projector import MarkerProjector, placed_markers
 from systems.messages import (
     AvoiderState,
@@ -153,7 +155,6 @@ from systems.sensors.rendered_camera import RenderedCamera
 from systems.sensors.ultrasonic import UltrasonicParameters, UltrasonicRing
 from systems.sensors.wheel_encoders import WheelEncoders
 from systems.shell.marker_pose import ShellMarkerPose, shell_localizer
-from systems.shell.markers_seen import MarkersSeen
 
 # --- One of each, with inputs ---
 
@@ -287,7 +288,7 @@ def recorder(folder: Path) -> Case:
 def viewer(_: Path) -> Case:
     system = EstimateViewer(
         meshcat=Meshcat(MeshcatParams(host="localhost")),
-        body=DifferentialDriveParameters(),
+        ghost=DifferentialDriveBody().ghost(),
         waypoints=np.zeros((1, 2)),
         radius=0.3,
         rate=10.0,

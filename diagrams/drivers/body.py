@@ -11,6 +11,7 @@ from pydrake.systems.primitives import Integrator, MatrixGain, PassThrough
 
 from diagrams.channels import truth_signal
 from diagrams.station import Robot, StationBuilder
+from diagrams.viewer import Ghost, ghost_of
 from plants.body_state import BodyState, TwinState
 from plants.differential_drive import (
     DifferentialDriveParameters,
@@ -41,6 +42,10 @@ class WheeledBody(ABC):
     @abstractmethod
     def hull(self) -> list[float]:
         """[front, rear, half_width] of the rectangle about base_link that holds the robot, m."""
+
+    @abstractmethod
+    def ghost(self) -> Ghost:
+        """Returns how it looks where it believes to be."""
 
     @abstractmethod
     def add_model(self, station: StationBuilder, robot: Robot) -> None:
@@ -134,6 +139,19 @@ class DifferentialDriveBody(WheeledBody):
     def hull(self) -> list[float]:
         """[front, rear, half_width] of the rectangle about base_link that holds the robot, m."""
         return hull(self.parameters)
+
+    def ghost(self) -> Ghost:
+        """Returns how it looks where it believes to be."""
+        p = self.parameters
+        return ghost_of(
+            length=p.length,
+            width=p.width,
+            clearance=p.clearance,
+            height=p.clearance + p.height,
+            wheels={"right_wheel": (0.0, -p.base / 2), "left_wheel": (0.0, p.base / 2)},
+            wheel_radius=p.wheel_radius,
+            wheel_width=p.wheel_width,
+        )
 
     def add_model(self, station: StationBuilder, robot: Robot) -> None:
         """Adds the robot to the plant, at its start.

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 from diagrams.drivers.body import WheeledBody
 from diagrams.station import Robot, StationBuilder
+from diagrams.viewer import Ghost, ghost_of
 from plants.limo import LimoParameters, add_limo, hull
 from plants.wheels import Sides
 from systems.angles import spatial_pose
@@ -38,6 +39,23 @@ class LimoBody(WheeledBody):
     def hull(self) -> list[float]:
         """[front, rear, half_width] of the rectangle about base_link that holds the robot, m."""
         return hull(self.parameters)
+
+    def ghost(self) -> Ghost:
+        """Returns how it looks where it believes to be."""
+        p = self.parameters
+        x, y = p.wheelbase / 2, p.track / 2
+        return ghost_of(
+            length=p.length,
+            width=p.track - p.wheel_width,
+            clearance=p.clearance,
+            height=p.height,
+            wheels={
+                "front_right": (x, -y), "front_left": (x, y),
+                "rear_right": (-x, -y), "rear_left": (-x, y),
+            },
+            wheel_radius=p.wheel_radius,
+            wheel_width=p.wheel_width,
+        )  # fmt: skip
 
     def add_model(self, station: StationBuilder, robot: Robot) -> None:
         """Adds the robot to the plant, at its start; its wheels are turned by speed servos."""

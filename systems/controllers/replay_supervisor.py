@@ -230,6 +230,7 @@ class ReplaySupervisor(LeafSystem):
         output_ports:
         - command
         - state
+        - verdict
         - health
 
     Args:
@@ -249,6 +250,9 @@ class ReplaySupervisor(LeafSystem):
             unconnected: then nothing is looked for.
         command (output, vector of 2): what is left of the tracker's, at `rate`.
         state (output, ReplayState): status (see `STATUSES`) and reasons.
+        verdict (output, vector of 6): the same as numbers: time (s; NaN before the first look),
+            index of the status, scale, age of the last accepted sight (s), radius (m), free way
+            ahead (m).
         health (output, Health): commands that were not finite; how often the robot had to stand
             because it was lost, because the estimate began anew, and because the way was blocked.
 
@@ -283,6 +287,7 @@ class ReplaySupervisor(LeafSystem):
             self._calc_state,
             {self.discrete_state_ticket(self._verdict)},
         )
+        self._verdict_output = self.DeclareStateOutputPort("verdict", self._verdict)
         self._counts = Counts(self, "bad_command", "lost", "relocalised", "blocked")
 
     def command_input_port(self) -> InputPort:
@@ -312,6 +317,10 @@ class ReplaySupervisor(LeafSystem):
     def state_output_port(self) -> OutputPort:
         """Returns the port of what it lets the robot do."""
         return self._state_output
+
+    def verdict_output_port(self) -> OutputPort:
+        """Returns the port of the state as numbers."""
+        return self._verdict_output
 
     def health_output_port(self) -> OutputPort:
         """Returns the port of the counts."""

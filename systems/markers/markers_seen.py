@@ -1,4 +1,4 @@
-"""How many markers a robot has met, and whether it sees one now."""
+"""How many markers a robot has met, and whether it sees enough of them now."""
 
 from __future__ import annotations
 
@@ -30,26 +30,28 @@ class MarkersSeen(LeafSystem):
     Args:
         marker_map: which markers count.
         rate: how often it looks, Hz; at least the camera's.
+        enough: how many markers a picture is to show.
 
     Ports:
         detections (input, Detections): of the camera.
-        seen (output, vector of 3): whether the latest picture shows a marker of the map (1 or 0),
-            the number of different ones so far, and the share of pictures so far that showed one
-            (0 before the first picture); at `rate`.
+        seen (output, vector of 3): whether the latest picture shows enough markers of the map (1 or
+            0), the number of different ones met so far, and the share of pictures so far that
+            showed enough (0 before the first picture); at `rate`.
 
     Raises:
-        ValueError: rate out of range.
+        ValueError: rate or number out of range.
     """
 
-    def __init__(self, *, marker_map: MarkerMap, rate: float) -> None:
+    def __init__(self, *, marker_map: MarkerMap, rate: float, enough: int = 1) -> None:
         super().__init__()
-        require_positive(rate=rate)
+        require_positive(rate=rate, enough=enough)
+        self._enough = enough
         self._ids = np.array(sorted(marker_map.markers))
         self._detections_input = self.DeclareAbstractInputPort(
             "detections", AbstractValue.Make(Detections())
         )
         self._met = self.DeclareDiscreteState(len(self._ids))
-        # Whether one is in view, how many were met, the share; then stamp, pictures, with a marker.
+        # Whether enough are in view, how many were met, share; then stamp, pictures, with enough.
         self._seen = self.DeclareDiscreteState([0.0, 0.0, 0.0])
         self._pictures = self.DeclareDiscreteState([math.nan, 0.0, 0.0])
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
@@ -70,7 +72,8 @@ class MarkersSeen(LeafSystem):
             return
         known = (self._ids[:, None] == detections.ids).any(axis=1)
         met = np.maximum(context.get_discrete_state(self._met).get_value(), known)
-        pictures, shown = pictures + 1, shown + known.any()
+        enough = known.sum() >= self._enough
+        pictures, shown = pictures + 1, shown + enough
         discrete_state.set_value(self._met, met)
         discrete_state.set_value(self._pictures, [detections.stamp, pictures, shown])
-        discrete_state.set_value(self._seen, [float(known.any()), met.sum(), shown / pictures])
+        discrete_state.set_value(self._seen, [float(enough), met.sum(), shown / pictures])

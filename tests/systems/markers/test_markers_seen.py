@@ -10,9 +10,9 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder, LeafSystem
 
+from systems.markers.markers_seen import MarkersSeen
 from systems.messages import Detections
 from systems.shell.layout import shell_markers
-from systems.shell.markers_seen import MarkersSeen
 
 RATE = 60.0
 NOTHING = (0.0, 0.0, 0.0)
