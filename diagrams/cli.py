@@ -123,6 +123,27 @@ def _parser() -> argparse.ArgumentParser:
     detect.add_argument("--size", type=float, metavar="M", help="side of the black square, metres")
     detect.add_argument("--camera", type=Path, metavar="FILE", help="camera file")
     detect.add_argument("--out", type=Path, default=Path("out/detect"), metavar="DIR")
+    route = command("route", _route, "make a drivable route from a map and a taught trajectory")
+    route.add_argument("map", type=Path, help="marker map (JSON)")
+    route.add_argument("trajectory", type=Path, help="TUM file, of the camera or of the robot")
+    route.add_argument("--out", type=Path, default=Path("out/route.json"), metavar="FILE")
+    route.add_argument(
+        "--set", action="append", default=[], metavar="LIMIT=VALUE", help="change a limit"
+    )
+    route.add_argument(
+        "--camera", type=Path, metavar="FILE", help="camera file [camera.yaml beside the map]"
+    )
+    route.add_argument(
+        "--camera-ahead", type=float, default=0.0, metavar="M",
+        help="how far the camera sits ahead of the robot's base_link, metres [0]",
+    )  # fmt: skip
+    route.add_argument(
+        "--camera-height", type=float, default=0.2, metavar="M",
+        help="its height above base_link, for a robot's trajectory, metres [0.2]",
+    )  # fmt: skip
+    ends = route.add_mutually_exclusive_group()
+    ends.add_argument("--closed", action="store_true", default=None, help="refuse an open path")
+    ends.add_argument("--open", action="store_false", dest="closed", help="do not close the path")
     return parser
 
 
@@ -265,6 +286,31 @@ def _map(options: argparse.Namespace) -> int:
 
     with _progress() as progress:
         return run_map(options, console, progress)
+
+
+def _route(options: argparse.Namespace) -> int:
+    from diagrams.route import Mounting, beside, make_route
+
+    plan = make_route(
+        options.map,
+        options.trajectory,
+        out=options.out,
+        camera=options.camera,
+        mounting=Mounting(options.camera_ahead, options.camera_height),
+        closed=options.closed,
+        changes=options.set,
+    )
+    kind = "closed" if plan.route.closed else "open"
+    table = RichTable("what", "value", title=f"{kind} route of {plan.route.length:.2f} m")
+    for key, value in plan.metrics().items():
+        table.add_row(key, f"{value:.4g}")
+    for name, share in plan.binds.items():
+        table.add_row(f"{name} binds", f"{share:.0%} of the way")
+    console.print(table)
+    console.print(f"route:  {options.out}")
+    console.print(f"report: {beside(options.out, '_report.json')}")
+    console.print(f"figure: {beside(options.out, '.png')}")
+    return 0
 
 
 @contextmanager
