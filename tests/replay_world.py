@@ -44,6 +44,7 @@ X_BC = RigidTransform(
     RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])),
     [0.1, 0.0, 0.2],
 )
+_TICKS = 20000  # of which noise is at hand
 FAMILY = family("36h11")
 
 
@@ -116,6 +117,7 @@ class Truth:
         yaw_noise: what each control step turns besides, rad/s.
         gyro_noise: rad/s/sqrt(Hz).
         gyro_bias: rad/s.
+        gyro: whether there is one that works.
         pixel_noise: px.
         latency: of the camera, s.
         blind: from when to when nothing is seen, s.
@@ -126,6 +128,7 @@ class Truth:
     yaw_noise: float = 0.1
     gyro_noise: float = 8.7e-5
     gyro_bias: float = 0.01
+    gyro: bool = True
     pixel_noise: float = 0.3
     latency: float = 0.05
     blind: tuple[float, float] = (math.inf, math.inf)
@@ -137,7 +140,10 @@ class SlippingRobot(LeafSystem):
 
     def __init__(self, truth: Truth, start: Array, seed: int) -> None:
         super().__init__()
-        self._truth, self._seed = truth, seed
+        self._truth = truth
+        rng = np.random.default_rng([seed, 1])
+        self._mine = rng.standard_normal((_TICKS, 2))
+        self._steps = rng.standard_normal(_TICKS)
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._pose = self.DeclareDiscreteState(start)
         self._yaw_rate = self.DeclareDiscreteState(1)
@@ -149,15 +155,14 @@ class SlippingRobot(LeafSystem):
     def _move(self, context: Context, discrete_state: DiscreteValues) -> None:
         t, dt = self._truth, 1 / RATE
         k = round(context.get_time() * RATE)
-        mine = np.random.default_rng([self._seed, 1, k]).standard_normal(3)
-        step = np.random.default_rng([self._seed, 2, int(k * CONTROL / RATE)]).standard_normal()
+        mine, step = self._mine[k], self._steps[int(k * CONTROL / RATE)]
         wander = float(context.get_discrete_state(self._wander)[0])
         wander += -wander * dt + math.sqrt(2 * dt) * mine[0]  # a second's memory, deviation 1
         left = 1 - t.slip * (1 + 0.5 * wander)
         v, omega = left * self._command_input.Eval(context)
         omega += t.yaw_noise * step
         x, y, theta = context.get_discrete_state(self._pose).get_value()
-        if round(t.moved[0] * RATE) == k if math.isfinite(t.moved[0]) else False:
+        if k / RATE == t.moved[0]:
             x, y, theta = np.array([x, y, theta]) + t.moved[1]
         middle = theta + omega * dt / 2
         discrete_state.set_value(
@@ -165,6 +170,7 @@ class SlippingRobot(LeafSystem):
             [x + v * dt * math.cos(middle), y + v * dt * math.sin(middle), theta + omega * dt],
         )
         felt = omega + t.gyro_bias + t.gyro_noise * math.sqrt(RATE) * mine[1]
+        felt = felt if t.gyro else math.nan
         discrete_state.set_value(self._yaw_rate, [felt])
         discrete_state.set_value(self._wander, [wander])
 
