@@ -65,6 +65,11 @@ def run_map(
     if len(anchors) > 1:
         raise ValueError(f"--anchor: one tag, not {', '.join(map(str, anchors))}")
     size, own_sizes = sizes(options.size)
+    known = options.map
+    if known is None and size is None and not own_sizes and not anchors:
+        known = taught_anchor(options.recording)
+        if known is not None:
+            console.print(f"the run's {known.name} says where its anchor is and how large tags are")
     out = options.out or Path("out") / "map" / options.recording.resolve().stem
     run = map_recording(
         options.recording,
@@ -75,7 +80,7 @@ def run_map(
         anchor=anchors[0] if anchors else None,
         camera=options.camera,
         topic=options.topic,
-        known=options.map,
+        known=known,
         localize_only=options.localize_only,
         connected_only=options.connected_only,
         meshcat=None if options.no_meshcat else start_meshcat(),
@@ -90,6 +95,19 @@ def run_map(
     if not options.no_meshcat:
         console.print(f"replay:  {out / 'replay.html'} (opens in a browser)")
     return 0 if run.succeeded else 1
+
+
+def taught_anchor(recording: Path) -> Path | None:
+    """Returns the marker map of the anchor that `tagtrail run teach` writes beside its recording.
+
+    Args:
+        recording: the folder `bag` of a run, or the run's own folder.
+    """
+    folder = recording if recording.is_dir() else recording.parent
+    for place in (folder, folder.resolve().parent):
+        if (place / "anchor.json").is_file():
+            return place / "anchor.json"
+    return None
 
 
 def sizes(words: list[str]) -> tuple[float | None, dict[int, float]]:

@@ -18,6 +18,9 @@ Array = NDArray[np.float64]
 
 _WINDOW = 1.0  # m along the route, within which the next place is looked for
 _MOVES = STATUSES.index("slowing")  # from this status on the robot drives
+# A robot that begins beside the route has joined it when it believes to be this near, or has come
+# this far, m.
+_JOINED, _JOIN_WITHIN = 0.01, 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,22 +76,26 @@ class ReplayLog:
 def replay_metrics(log: ReplayLog) -> dict[str, Any]:
     """Returns the metrics of the way: by the truth, where there is one, else by the estimate.
 
-    `cross_track_*` are over the way from the first motion to the last, evenly in time;
-    `estimate_cross_track_rmse_m` is what the controller saw of it. `lap_time_s` is the time from
-    the first motion to the end of the last lap, by the number of laps on the route.
+    `cross_track_*` are over the way from where the robot has joined the route, evenly in time;
+    `estimate_cross_track_rmse_m` is what the controller saw of it. `joined_after_m` is the way
+    before: a robot may begin beside the route. `lap_time_s` is the time from the first motion to
+    the end of the last lap, by the number of laps on the route.
     """
     way = log.on_the_way()
     t, truth = log.poses.t[way], log.poses.truth
     names = ("cross_track_rmse_m", "cross_track_max_m", "estimate_cross_track_rmse_m",
-             "lap_time_s", "nearest_tag_m")  # fmt: skip
+             "joined_after_m", "lap_time_s", "nearest_tag_m")  # fmt: skip
     metrics: dict[str, Any] = dict.fromkeys(names)
     metrics["route_length_m"] = log.route.length
     metrics["two_tag_fraction"] = log.two_tag_fraction
     if len(t):
         run, seen = log.cross_track(log.poses.estimate[way])
-        metrics["estimate_cross_track_rmse_m"] = float(np.sqrt((seen**2).mean()))
+        joined = int(np.argmax((np.abs(seen) < _JOINED) | (run > _JOIN_WITHIN)))
+        metrics["joined_after_m"] = float(run[joined])
+        metrics["estimate_cross_track_rmse_m"] = float(np.sqrt((seen[joined:] ** 2).mean()))
         if truth is not None:
             run, off = log.cross_track(truth[way])
+            off = off[joined:]
             metrics["cross_track_rmse_m"] = float(np.sqrt((off**2).mean()))
             metrics["cross_track_max_m"] = float(np.abs(off).max())
             metrics["nearest_tag_m"] = _nearest(truth[way], log.tags)

@@ -84,10 +84,10 @@ def draw_way(axes: Array, log: ReplayLog) -> None:
     t = log.poses.t
     path = log.poses.estimate if log.poses.truth is None else log.poses.truth
     if len(t) > 1:
-        smooth = np.ones(10) / 10  # samples; of single ones the steps are too short
-        speed = np.hypot(*np.diff(path[:, :2], axis=0).T) / np.maximum(np.diff(t), 1e-9)
-        speed = np.convolve(speed, smooth, mode="same")
-        axes[1].plot(t[1:], speed, **(_ESTIMATE if log.poses.truth is None else _TRUTH))
+        n = min(10, len(t) - 1)  # samples, over which the speed is a mean
+        way = np.hypot(*(path[n:, :2] - path[:-n, :2]).T)
+        style = _ESTIMATE if log.poses.truth is None else _TRUTH
+        axes[1].plot((t[n:] + t[:-n]) / 2, way / np.maximum(t[n:] - t[:-n], 1e-9), **style)
     axes[1].set_ylabel("speed [m/s]")
     seen = [k for k in range(len(STATUSES)) if (log.status == k).any()]
     place = {k: row for row, k in enumerate(seen)}

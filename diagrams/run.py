@@ -89,9 +89,10 @@ def simulate(
     require_non_negative(realtime=realtime)
     if out is not None:
         _make_folder(out)
+    ready = scenario.prepared(meshcat=meshcat, out=out)
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=FRAME_RATE)
-    mission: Mission = scenario.build(meshcat=meshcat, out=out)
+    mission: Mission = ready.build(meshcat=meshcat, out=out)
     if out is not None:  # from here on the folder is this run's
         for pattern in RESULTS:
             for path in out.glob(pattern):
@@ -101,7 +102,7 @@ def simulate(
     gc.freeze()  # diagram and modules stay: to look through them again and again costs 5 %
     try:
         outcome, context, wall = _advance(
-            scenario, mission, realtime or scenario.realtime_rate, progress
+            scenario, mission, realtime or ready.realtime_rate, progress
         )
     finally:
         gc.unfreeze()

@@ -12,8 +12,9 @@ import io
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, Self
 
+from pydrake.geometry import Meshcat
 from ruamel.yaml import YAML, YAMLError
 
 from diagrams.random_world import ROOM, RandomWorld, asks_for_random, draw_world, make_way
@@ -41,6 +42,7 @@ MISSIONS = Table(
         "snailbot": "diagrams.snailbot:SnailBotScenario",
         "tag_frames": "diagrams.tag_frames:TagFramesScenario",
         "teach": "diagrams.teach:TeachScenario",
+        "teach_replay": "diagrams.teach_replay:TeachReplayScenario",
     },
     method="build",
 )
@@ -100,6 +102,16 @@ class Scenario:
     def time_limit(self) -> float:
         """When the run ends at the latest, s."""
         return self.duration
+
+    def prepared(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Self:
+        """Does what has to be done before the run; returns the scenario that is then built.
+
+        Args:
+            meshcat: where it is shown, if anywhere.
+            out: folder of the run; None writes nothing.
+        """
+        del meshcat, out
+        return self
 
     @property
     def realtime_rate(self) -> float:

@@ -181,7 +181,7 @@ def supervise(
         memory = memory._replace(refused=view.refused)
     age = now - memory.seen
     free = p.stop_distance if math.isnan(view.free) else view.free
-    near = free <= p.stop_distance + _NEAR
+    near = view.free <= p.stop_distance + _NEAR
     if near:
         memory = memory._replace(blocked=now)
     fading = min(
