@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem
 from systems.angles import spatial_pose
 from systems.mapping.tag_frames import TagFrame
 from systems.markers.layout import MarkerMap
+from systems.planners.closed_curve import ClosedCurve
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -28,6 +29,7 @@ _AXES = {
     "y": (Rgba(0.15, 0.7, 0.15, 1.0), RollPitchYaw(-math.pi / 2, 0.0, 0.0)),
     "z": (Rgba(0.2, 0.3, 0.95, 1.0), RollPitchYaw(0.0, 0.0, 0.0)),
 }
+_DASH = 0.12  # m of the route; as much again is left out
 _STEP = 0.1  # m between two marks of the path
 
 
@@ -173,6 +175,31 @@ def appear(meshcat: Meshcat, path: str, t: float) -> None:
     if t > 0:
         meshcat.SetProperty(path, "visible", False, 0.0)
     meshcat.SetProperty(path, "visible", True, t)
+
+
+def draw_route(meshcat: Meshcat, curve: ClosedCurve) -> None:
+    """Draws a closed route as dashes on the ground, with an arrow's head at its start."""
+    for k, s in enumerate(np.arange(0.0, curve.length - _DASH, 2 * _DASH)):
+        place, heading = curve.at(s + _DASH / 2)
+        name = f"{_ROOT}/route/{k}"
+        meshcat.SetObject(name, Box(_DASH, 0.025, 0.002), Rgba(0.95, 0.95, 0.9, 1.0))
+        meshcat.SetTransform(name, spatial_pose(np.array([*place, heading]), 0.002))
+    place, heading = curve.at(0.0)
+    for side in (-1, 1):
+        barb = np.array([*place, heading + side * 0.75 * math.pi])
+        barb[:2] += 0.09 * np.array([math.cos(barb[2]), math.sin(barb[2])])
+        name = f"{_ROOT}/route/start {'left' if side > 0 else 'right'}"
+        meshcat.SetObject(name, Box(0.18, 0.03, 0.002), Rgba(0.95, 0.95, 0.9, 1.0))
+        meshcat.SetTransform(name, spatial_pose(barb, 0.003))
+
+
+def look_at(meshcat: Meshcat, places: Array) -> None:
+    """Points Meshcat's camera at places (n, 3) m, from the south and above."""
+    low, high = places.min(axis=0), places.max(axis=0)
+    middle, (wide, deep, _) = (low + high) / 2, high - low
+    away = max(1.5, 0.4 * wide, 0.55 * deep)  # windows are wider than high
+    eye = np.array([middle[0], middle[1] - 0.5 * deep - 0.2 * away, away])
+    meshcat.SetCameraPose(eye, np.array([middle[0], middle[1] - 0.1 * deep, 0.0]))
 
 
 def show_chained(

@@ -18,7 +18,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource
 
-from diagrams.frames_viewer import FramesViewer
+from diagrams.frames_viewer import FramesViewer, look_at
 from diagrams.mission import FRAME_RATE, Mission, Wiring
 from diagrams.scenario import Scenario
 from diagrams.station import RobotParameters
@@ -132,6 +132,7 @@ class TagFramesMission(Mission):
                 rate=FRAME_RATE,
             )
             wiring.add(viewer, "viewer")
+            look_at(meshcat, np.array([m.X_WM.translation() for m in self._true_markers]))
             wiring.connect("frames.frame", "viewer.frame")
             if self._has_truth:
                 wiring.connect(self._truth, "viewer.pose")

@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import ConstantVectorSource, Multiplexer
 
-from diagrams.frames_viewer import FramesViewer, show_chained
+from diagrams.frames_viewer import FramesViewer, draw_route, look_at, show_chained
 from diagrams.mission import FRAME_RATE, Mission, Wiring
 from diagrams.teach_log import Chained, TeachLog, chain_metrics, counted, driven
 from diagrams.teach_recording import (
@@ -25,6 +25,7 @@ from diagrams.trajectories import write_poses, write_tum
 from systems.angles import spatial_pose
 from systems.estimators.wheel_odometry import WheelOdometry
 from systems.mapping.tag_frames import TagFrames
+from systems.planners.closed_curve import ClosedCurve
 from systems.pose_vector import pose_to_vector
 
 if TYPE_CHECKING:
@@ -112,6 +113,10 @@ class TeachMission(Mission):
         wiring.connect("driver.command", f"{ROBOT}.drive.command")
 
     def _show(self, meshcat: Meshcat) -> None:
+        curve = ClosedCurve(self._scenario.route)
+        draw_route(meshcat, curve)
+        tags = [marker.X_WM.translation() for marker in self._true_markers]
+        look_at(meshcat, np.array(tags))
         self._wiring.add(
             FramesViewer(
                 meshcat=meshcat,

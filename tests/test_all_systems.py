@@ -46,6 +46,7 @@ import plants
 import systems
 from diagrams.drivers.body import DifferentialDriveBody
 from diagrams.formation_viewer import FormationViewer
+from diagrams.frames_viewer import FramesViewer
 from diagrams.shell_viewer import ShellViewer
 from diagrams.surroundings_viewer import SurroundingsViewer
 from diagrams.viewer import EstimateViewer
@@ -79,6 +80,7 @@ from systems.controllers.mpc import Mpc
 from systems.controllers.path_tracking import TrackingState
 from systems.controllers.pure_pursuit import PurePursuit
 from systems.controllers.replay_supervisor import ReplaySupervisor
+from systems.controllers.scripted_driver import ScriptedDriver
 from systems.controllers.search import SearchWhenLost
 from systems.controllers.shell_route import Leg, ShellRoute
 from systems.controllers.step_task import StepTask
@@ -108,8 +110,10 @@ from systems.flow.sphere_flow import SphereFlow, SphereFlowEstimator
 from systems.formation.building import Algorithm1Parameters
 from systems.image_effects import ImageEffects
 from systems.io.bag import BagWriter
+from systems.io.meshcat_driver import MeshcatDriver
 from systems.io.playback import Entry, MessagePlayback, VectorPlayback
 from systems.io.recorder import Channel, Recorder
+from systems.mapping.tag_frames import TagFrame, TagFrames, observe
 from systems.markers.detector import Detector, MarkerDetector
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap
@@ -339,6 +343,22 @@ def surroundings_viewer(_: Path) -> Case:
     )
 
 
+def tag_frame(stamp: float, shift: float = 0.0) -> TagFrame:
+    return observe(detections(stamp, shift), camera=CAMERA, markers=MAP, anchor=7, pixel_noise=0.3)
+
+
+def frames_viewer(_: Path) -> Case:
+    system = FramesViewer(
+        meshcat=Meshcat(MeshcatParams(host="localhost")),
+        markers=MAP,
+        X_BC=X_WC,
+        anchor=7,
+        rate=10.0,
+    )
+    frames = (tag_frame(0.0), tag_frame(0.1, 1.0))
+    return Case(system, {"frame": frames, "pose": vector(0.0, 0.1, 0.2)})
+
+
 def vector(*first: float) -> tuple[np.ndarray, np.ndarray]:
     """The numbers, and larger ones."""
     return np.array(first), np.array(first) * 1.1 + 0.05
@@ -522,6 +542,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "progress": vector(0.0, 0.0),
         },
     ),
+    FramesViewer: frames_viewer,
     GyroYaw: lambda _: Case(GyroYaw(num_samples=3), {"imu": vector(0.0, 0.0, 0.1, 0.0, 0.0, 9.81)}),
     Imu: lambda _: Case(
         Imu(parameters=ImuParameters(gyro_noise_density=0.01), p_BS=np.array([0.1, 0.0, 0.0])),
@@ -576,6 +597,7 @@ CASES: dict[type, Callable[[Path], Case]] = {
         ),
         {"query_object": QUERIES, "active": vector(1.0)},
     ),
+    MeshcatDriver: lambda _: Case(MeshcatDriver(meshcat=Meshcat(MeshcatParams(host="localhost")))),
     MessagePlayback: lambda _: Case(
         MessagePlayback(
             entries=[Entry(round(1e8 * k), 0.1 * k, detections(0.1 * k)) for k in range(5)],
@@ -695,6 +717,10 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "active": vector(1.0),
         },
     ),
+    ScriptedDriver: lambda _: Case(
+        ScriptedDriver(route=[[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]]),
+        {"pose": vector(0.1, 0.05, 0.0)},
+    ),
     SearchWhenLost: lambda _: Case(
         SearchWhenLost(),
         {"command": vector(0.2, 0.1), "covariance": vector(*(0.01 * np.eye(3).ravel()))},
@@ -778,6 +804,10 @@ CASES: dict[type, Callable[[Path], Case]] = {
     SurroundingsViewer: surroundings_viewer,
     TriangleAlgorithm1: lambda _: formation_step(TriangleAlgorithm1),
     TriangleResection: lambda _: formation_step(TriangleResection),
+    TagFrames: lambda _: Case(
+        TagFrames(camera=CAMERA, markers=MAP, anchor=7, rate=20.0),
+        {"detections": (detections(1.0), Detections(stamp=2.0, family=TAG.name))},
+    ),
     TwinPositions: twin_positions,
     TwinState: lambda _: Case(
         TwinState(), {"twin_pose": vector(1.0, 2.0, 0.3), "twin_velocity": vector(0.3, 0.5)}

@@ -8,8 +8,9 @@ back to the beginning. Nothing comes back to a tag that has its place, so errors
 way, and a pose that is the wrong one of a square's two swings all that is chained to it.
 
 The gated chain is as careful as a chain can be. It uses no ambiguous pose. The tag comes next that
-appears largest together with those that have their places, in whatever frame; and cameras are
-placed by the corners of all such tags together, which do not flip.
+appears largest together with those that have their places, in whatever frame, and is placed by the
+mean of its best sightings; cameras are placed by the corners of all such tags together, which do
+not flip.
 
 Source: Martins do Lago Reis, da Silva Ramos, "AprilTag-based Trajectory Tracking for the LIMOS
 Robot", sections 3.2 and 4.1-4.2, is the naive chain, with the better one of the two poses. The gate
@@ -88,12 +89,15 @@ class _Links:
         """Gives a frame's camera its pose."""
         self.R_CW[frame], self.p_CW[frame], self.frames[frame] = R_CW, p_CW, True
 
-    def place_tag(self, sighting: int) -> None:
-        """Places a sighting's tag by its camera."""
-        tag, frame = self.sightings.tag[sighting], self.sightings.frame[sighting]
-        R_WC = self.R_CW[frame].T
-        self.R_WT[tag] = R_WC @ self.poses.R[sighting, 0]
-        self.p_WT[tag] = R_WC @ (self.poses.p[sighting, 0] - self.p_CW[frame])
+    def place_tag(self, sightings: Indices, weights: Array) -> None:
+        """Places a tag by the cameras of some of its sightings: the mean of what they say."""
+        s = self.sightings
+        frames, tag = s.frame[sightings], s.tag[sightings[0]]
+        R_WC = self.R_CW[frames].swapaxes(1, 2)
+        from_camera = self.poses.p[sightings, 0] - self.p_CW[frames]
+        R_WT = np.tensordot(weights / weights.sum(), R_WC @ self.poses.R[sightings, 0], 1)
+        self.R_WT[tag] = nearest_rotation(R_WT)
+        self.p_WT[tag] = weights @ (R_WC @ from_camera[..., None])[..., 0] / weights.sum()
         self.tags[tag] = True
 
     def chain(self) -> Chain:
@@ -126,7 +130,7 @@ def naive_chain(sightings: Sightings, *, anchor: int, X_W_anchor: RigidTransform
         preferred = np.where(s.tag[candidates] == anchor, np.inf, links.side[candidates])
         links.place_camera(frame, *links.through(candidates[np.argmax(preferred)]))
         for sighting in seen[~known]:
-            links.place_tag(sighting)
+            links.place_tag(np.array([sighting]), np.ones(1))
     return links.chain()
 
 
@@ -136,6 +140,7 @@ def gated_chain(
     anchor: int,
     X_W_anchor: RigidTransform,
     max_ambiguity: float = GATE,
+    pictures: int = 8,
 ) -> Chain:
     """Chains the surest poses first, and no ambiguous ones.
 
@@ -144,11 +149,13 @@ def gated_chain(
         anchor: number of the tag whose pose is known.
         X_W_anchor: its pose.
         max_ambiguity: no tag is placed by a pose that is more ambiguous than this; see `ambiguity`.
+        pictures: a tag is placed by the mean of so many of its sightings, the best ones.
 
     Raises:
-        ValueError: the anchor is none of the tags, or the gate is negative.
+        ValueError: the anchor is none of the tags, the gate is negative, or there is no picture.
     """
     require(max_ambiguity >= 0, "max_ambiguity", max_ambiguity, "0 or greater")
+    require(pictures >= 1, "pictures", pictures, "1 or more")
     links = _Links(sightings, anchor, X_W_anchor)
     s = sightings
     sure = links.usable & (ambiguity(links.poses.squared_error) <= max_ambiguity)
@@ -159,10 +166,14 @@ def gated_chain(
         ready = sure & ~known & (of_frame > 0)
         if not ready.any():
             break
-        variance = 1 / area[ready] + 1 / of_frame[ready]
-        best = int(np.flatnonzero(ready)[np.argmin(variance)])
-        _place_by_all(links, int(s.frame[best]))
-        links.place_tag(best)
+        variance = np.full(len(s), np.inf)
+        variance[ready] = 1 / area[ready] + 1 / of_frame[ready]
+        same = np.flatnonzero(s.tag == s.tag[np.argmin(variance)])
+        best = same[np.argsort(variance[same], kind="stable")[:pictures]]
+        best = best[np.isfinite(variance[best])]
+        for sighting in best:
+            _place_by_all(links, int(s.frame[sighting]))
+        links.place_tag(best, variance[best] ** -2.0)
     for frame in range(s.frames):
         _place_by_all(links, frame)
     return links.chain()
@@ -189,6 +200,12 @@ def _place_by_all(links: _Links, frame: int) -> None:
     best = int(np.argmin(found.squared_error))
     if np.isfinite(found.squared_error[best]):
         links.place_camera(frame, found.R[best], found.p[best])
+
+
+def nearest_rotation(M: Array) -> Array:
+    """Returns the rotation nearest to a matrix (3, 3) that is a mean of rotations."""
+    U, _, Vt = np.linalg.svd(M)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
 
 
 def ambiguity(squared_error: Array) -> Array:
