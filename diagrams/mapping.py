@@ -21,7 +21,7 @@ from diagrams.mapping_viewer import show_map
 from diagrams.schema import ScenarioError
 from diagrams.trajectories import write_poses
 from systems.cameras import PinholeCamera
-from systems.mapping.camera_check import suspect_camera
+from systems.mapping.camera_check import Freed, suspect_camera
 from systems.mapping.gathering import Gathered, gather
 from systems.mapping.mapping import MappingParameters, TagMap, build_map
 from systems.mapping.trajectory import Trajectory, trajectory
@@ -155,7 +155,7 @@ def map_recording(
     before = time.perf_counter()
     gathered, tag_map = mapped(observed.camera)
     solved = time.perf_counter() - before
-    reasons = suspect_camera(
+    freed, reasons = suspect_camera(
         tag_map,
         observed.camera,
         remap=lambda camera: mapped(camera, thinned=True)[1],
@@ -189,6 +189,7 @@ def map_recording(
             "source": observed.source,
             "trajectory_of": observed.body or observed.frame_id or "camera",
         },
+        "camera": camera_row(observed.camera, freed),
         "tags": tag_rows(tag_map),
     }
     marker_map = as_marker_map(tag_map, observed, sizes, given)
@@ -215,6 +216,19 @@ def as_marker_map(
         markers.setdefault(marker_id, Marker(marker_id, X_WM, size))
     frame = given.frame if given is not None else "map"
     return MarkerMap(observed.family, sizes.usual, dict(sorted(markers.items())), frame)
+
+
+def camera_row(camera: PinholeCamera, freed: Freed) -> dict[str, float]:
+    """Returns the camera as it was told, and as the recording alone would have it."""
+    focal = math.sqrt(camera.K[0, 0] * camera.K[1, 1])
+    return {
+        "focal_length_px": focal,
+        "focal_length_freed_px": focal * freed.focal[0],
+        "focal_length_freed_sigma_px": focal * freed.focal[1],
+        "k1": float(camera.D[0]),
+        "k1_freed": float(camera.D[0]) + freed.radial[0],
+        "chi2_explained_fraction": freed.explained,
+    }
 
 
 def tag_rows(tag_map: TagMap) -> list[dict[str, Any]]:

@@ -320,6 +320,7 @@ def settle_tags(
     s = replace(sightings, by_ray=sightings.by_ray / pixel_noise)
     damping = np.full(s.tags, _TAG_DAMPING)
     cost = robust_cost(scene, s, 1.0)
+    moving = np.ones(s.tags, bool)
     for _ in range(iterations):
         r, _, by_tag = residuals(scene, s)
         squared = (r * r).sum(axis=1)
@@ -332,15 +333,16 @@ def settle_tags(
         steps = np.asarray(-np.linalg.solve(H, product[:, :6, 6:])[..., 0], np.float64)
         moved = scene.moved(np.zeros((s.frames, 6)), steps)
         trial = robust_cost(moved, s, 1.0)
-        better = trial < cost
+        better = moving & (trial < cost)
         R, p = scene.R_WT.copy(), scene.p_WT.copy()
         R[better], p[better] = moved.R_WT[better], moved.p_WT[better]
         scene = replace(scene, R_WT=R, p_WT=p)
-        done = np.abs(trial - cost) <= 1e-4 * (1 + cost)
+        moving &= np.abs(trial - cost) > 1e-4 * (1 + cost)
         cost = np.where(better, trial, cost)
         damping *= np.where(better, 0.1, 10.0)
-        if done.all():
+        if not moving.any():
             break
+        s = s.select(moving[s.tag])
     return scene
 
 

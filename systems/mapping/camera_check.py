@@ -31,7 +31,7 @@ _FACTORS = (0.5, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 2.0)  # of focal lengths that ar
 _FITS = 0.5  # of the misfit, at most, is left where one of them is right
 _EXPLAINS = 0.1  # of the cost, at least, goes where something was told wrong
 _HARMLESS = 0.01  # of the focal length, and of sizes
-_HARMLESS_PX = 1.0  # of the distortion, RMS over the corners
+_HARMLESS_PX = 2.5  # of the distortion, RMS over the corners: lenses are not quite as modelled
 _LAST_DAMPING = 1e12
 _LONGEST = 0.3  # step of a value
 _FIXED = 1e30  # information of what is not free
@@ -120,8 +120,8 @@ def suspect_camera(
     *,
     remap: Callable[[PinholeCamera], TagMap],
     sizes: bool = False,
-) -> dict[str, str]:
-    """Returns what was told wrong: reason to a line that says what it looks like.
+) -> tuple[Freed, dict[str, str]]:
+    """Returns what it looks like, and what was told wrong: reason to a line that says so.
 
     Args:
         tag_map: as the camera has it.
@@ -152,10 +152,10 @@ def suspect_camera(
         pixel_noise=tag_map.pixel_noise,
         sizes=sizes,
     )
+    freed = replace(freed, focal=(freed.focal[0] * scale, freed.focal[1]))
     if scale == 1.0 and freed.explained < _EXPLAINS:
-        return {}
-    focal = (freed.focal[0] * scale, freed.focal[1])
-    return doubts(replace(freed, focal=focal), camera)
+        return freed, {}
+    return freed, doubts(freed, camera)
 
 
 def _misfit(tag_map: TagMap) -> float:

@@ -162,7 +162,6 @@ def build_map(
         result = adjusted(_with_tags(result.scene, other, flipped), sightings)
     if not p.pixel_noise:
         noise *= _noise_factor(result, sightings, len(held))
-        result = adjusted(result.scene, sightings)
     everything = sightings
     for tolerance in (1e-3, 1e-7):  # what a bad start has spoiled may fit after all
         limit = _OUTLIER * noise

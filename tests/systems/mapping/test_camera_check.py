@@ -37,7 +37,7 @@ def suspected(camera: PinholeCamera, **arguments: object) -> dict[str, str]:
         return mapped(camera, **arguments)  # type: ignore[arg-type]
 
     sizes = arguments.get("tags") is not None
-    return suspect_camera(remap(camera), camera, remap=remap, sizes=sizes)
+    return suspect_camera(remap(camera), camera, remap=remap, sizes=sizes)[1]
 
 
 def test_the_right_camera_is_not_suspected() -> None:
