@@ -38,6 +38,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--topic", help="of detections or pictures, if there are several")
     parser.add_argument(
+        "--odometry", metavar="TOPIC", help="nav_msgs/Odometry of the body that smooths the way"
+    )
+    parser.add_argument(
         "--map", type=Path, metavar="FILE", help="known tags: they stay, new ones are added"
     )
     parser.add_argument(
@@ -80,6 +83,7 @@ def run_map(
         anchor=anchors[0] if anchors else None,
         camera=options.camera,
         topic=options.topic,
+        odometry=options.odometry,
         known=known,
         localize_only=options.localize_only,
         connected_only=options.connected_only,

@@ -16,7 +16,7 @@ from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RotationMatrix
 
 from diagrams.mapping_plots import plot_map
-from diagrams.mapping_source import Observed, observe
+from diagrams.mapping_source import Observed, observe, wheel_odometry
 from diagrams.mapping_viewer import show_map
 from diagrams.schema import ScenarioError
 from diagrams.trajectories import write_poses
@@ -24,6 +24,7 @@ from systems.cameras import PinholeCamera
 from systems.mapping.camera_check import Freed, suspect_camera
 from systems.mapping.gathering import Gathered, gather
 from systems.mapping.mapping import MappingParameters, TagMap, build_map
+from systems.mapping.odometry import motion_of_odometry
 from systems.mapping.trajectory import Trajectory, trajectory
 from systems.markers.layout import Marker, MarkerMap, load_map
 from systems.messages import Detections
@@ -88,6 +89,7 @@ def map_recording(
     anchor: int | None = None,
     camera: Path | None = None,
     topic: str | None = None,
+    odometry: str | None = None,
     known: Path | None = None,
     localize_only: bool = False,
     connected_only: bool = False,
@@ -112,6 +114,7 @@ def map_recording(
         anchor: id of the tag that is the map's origin; None takes the one seen most often.
         camera: camera file; None takes the recording's own.
         topic: of detections or pictures, where a recording has several.
+        odometry: topic of the body's odometry, which smooths the way; None takes none.
         known: marker map whose tags stay where it has them; others are added.
         localize_only: add none.
         connected_only: leave tags out that no picture connects to the others, instead of refusing.
@@ -138,6 +141,7 @@ def map_recording(
     detections, unknown = observed.detections, 0
     if localize_only and given is not None:
         detections, unknown = _of_map(detections, given)
+    wheels = None if odometry is None else wheel_odometry(recording, odometry, observed)
     poses = None if given is None else {marker.id: marker.X_WM for marker in given}
 
     def mapped(camera: PinholeCamera, thinned: bool = False) -> tuple[Gathered, TagMap]:
@@ -149,8 +153,13 @@ def map_recording(
             sizes=sizes.own,
             min_frames=1 if localize_only or thinned else _MIN_FRAMES,
         )
-        X = build_map(gathered, anchor=anchor, known=poses, parameters=parameters)
-        return gathered, X
+        motion = None
+        if wheels is not None and observed.X_BC is not None:
+            motion = motion_of_odometry(gathered.stamps, *wheels, X_BC=observed.X_BC)
+        found = build_map(
+            gathered, anchor=anchor, known=poses, motion=motion, parameters=parameters
+        )
+        return gathered, found
 
     before = time.perf_counter()
     gathered, tag_map = mapped(observed.camera)

@@ -8,13 +8,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from pydrake.math import RigidTransform
 
 from diagrams.schema import ScenarioError
 from diagrams.sources import camera_of, cameras_of, is_recording, pictures
+from systems.angles import planar_pose
 from systems.cameras import PinholeCamera, load_camera
 from systems.io.bag import BagReader
-from systems.io.ros_motion import transforms_from_ros
+from systems.io.ros_motion import estimate_from_ros, transforms_from_ros
 from systems.io.ros_vision import detections_from_ros, image_from_ros, tags_of
 from systems.markers.detector import MarkerDetector
 from systems.markers.family import Family
@@ -25,11 +27,13 @@ DETECTIONS = (
     "apriltag_msgs/msg/AprilTagDetectionArray",
     "apriltag_msgs/msg/ApriltagArrayStamped",
 )
+ODOMETRY = "nav_msgs/msg/Odometry"
 IMAGES = ("sensor_msgs/msg/CompressedImage", "sensor_msgs/msg/Image")
 USUAL_FAMILY = "tag36h11"
 _OUTSIDE = 0.01  # of the corners may lie this far out of the picture:
 _MARGIN = 2.0  # px
 
+Array = NDArray[np.float64]
 Progress = Callable[[float, float], None]
 
 
@@ -120,6 +124,38 @@ def _of_recording(
     if reader.truncated:
         notes.append(f"recording {path} is cut off or damaged: what is there was read")
     return Observed(detections, camera, named, topic, frame_id, body, X_BC, dropped, notes)
+
+
+def wheel_odometry(recording: Path, topic: str, observed: Observed) -> tuple[Array, Array]:
+    """Returns stamps (m,) s and planar poses (m, 3) of a recorded `nav_msgs/Odometry`.
+
+    Samples whose stamps do not ascend are dropped and counted (`bad_odometry`).
+
+    Raises:
+        ValueError: no such topic, or nobody says how the camera is mounted on the body.
+    """
+    reader = BagReader(recording)
+    kinds = reader.topics()
+    if kinds.get(topic) != ODOMETRY:
+        have = ", ".join(sorted(t for t, kind in kinds.items() if kind == ODOMETRY))
+        raise ScenarioError(f"--odometry {topic}: recording {recording} has {have or 'none'}")
+    if observed.X_BC is None:
+        raise ScenarioError(
+            f"--odometry {topic}: /tf_static does not say where the camera is on the body"
+        )
+    stamps: list[float] = []
+    poses: list[Array] = []
+    dropped = 0
+    for _, _, message in reader.messages([topic]):
+        found = estimate_from_ros(message)
+        pose = planar_pose(found.pose)
+        if np.isfinite(pose).all() and (not stamps or found.stamp > stamps[-1]):
+            stamps.append(found.stamp)
+            poses.append(pose)
+        else:
+            dropped += 1
+    observed.dropped["bad_odometry"] = dropped
+    return np.array(stamps), np.reshape(poses, (-1, 3))
 
 
 def _chosen(path: Path, kinds: dict[str, str], topic: str | None) -> str:

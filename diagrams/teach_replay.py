@@ -183,4 +183,4 @@ def _track(points: list[list[float]]) -> Route:
     (x, y), theta = curve.at(s)[0].T, np.unwrap(curve.at(s)[1])
     speed = np.full(n, v)
     omega = np.asarray(v * curve.curvature_at(s), np.float64)
-    return Route(_STEP * np.arange(n), x, y, theta, speed, omega, closed=True)
+    return Route(_STEP * np.arange(n, dtype=float), x, y, theta, speed, omega, closed=True)

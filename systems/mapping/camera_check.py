@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.cameras import PinholeCamera
-from systems.mapping.adjustment import CHUNK, System, robust_cost, summed
+from systems.mapping.adjustment import CHUNK, System, adjust, robust_cost, summed
 from systems.mapping.mapping import TagMap
 from systems.mapping.scene import Scene, residuals
 from systems.mapping.sightings import Sightings
@@ -81,6 +81,8 @@ def free_camera(
     free = np.array([True, True, sizes and not is_held.all(), sizes])
     model = _Model(sightings, camera, is_held, pixel_noise)
     values = np.zeros(4)
+    # What odometry held, which has no part in this, is not to look like the camera's fault.
+    scene = adjust(scene, sightings, anchor=held, pixel_noise=pixel_noise, covariances=False).scene
     seen = model.sightings(values)
     system = System(scene, seen, None, held, _HUBER)
     before, damping = system.cost, 1.0

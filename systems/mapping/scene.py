@@ -89,6 +89,7 @@ class Motion:
         R, p, root = [], [], []
         for first, last in itertools.pairwise(frames.tolist()):
             R_k, p_k, C = np.eye(3), np.zeros(3), np.zeros((6, 6))
+            known = all(self.root[k].any() for k in range(first, last))
             for k in range(first, last):
                 turned = np.zeros((6, 6))
                 turned[:3, :3] = turned[3:, 3:] = R_k
@@ -101,7 +102,7 @@ class Motion:
                 R_k, p_k = R_k @ self.R[k], p_k + R_k @ self.p[k]
             R.append(R_k)
             p.append(p_k)
-            root.append(np.linalg.cholesky(np.linalg.inv(C)).T)
+            root.append(np.linalg.cholesky(np.linalg.inv(C)).T if known else np.zeros((6, 6)))
         return Motion(np.array(R), np.array(p), np.array(root))
 
 

@@ -32,7 +32,7 @@ _SAME_PLACE = 0.15  # of the distance by less than this part, mean the same
 _ROUNDS = 3
 _STEPS = 2  # from the homography's poses to the corners'
 _WORSE = 2.0  # px^2; a tag's pose that leaves so much more than its other one counts half
-_AT_ONCE = 512  # groups whose votes are counted at a time: bounds the memory
+_AT_ONCE = 64  # groups whose votes are counted at a time: bounds the memory
 
 
 @dataclass(frozen=True, eq=False)

@@ -18,6 +18,7 @@ from diagrams.map_command import sizes
 from systems.cameras import PinholeCamera
 from systems.io.bag import BagWriter
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
+from systems.io.ros_types import header, message_class
 from systems.io.ros_vision import camera_to_ros, detections_to_ros
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap, load_map
@@ -54,6 +55,7 @@ def record(
     *,
     camera: PinholeCamera | None = CAMERA,
     mounted: bool = False,
+    wheels: Array | None = None,
     topics: Sequence[str] = (TOPIC,),
 ) -> Path:
     """Writes a recording of detections."""
@@ -70,10 +72,30 @@ def record(
                 "/tf_static", "tf2_msgs/msg/TFMessage", transforms_to_ros(chain), START,
                 latched=True,
             )  # fmt: skip
+        for k, pose in enumerate(() if wheels is None else wheels):
+            bag.write("/limo/odom", "nav_msgs/msg/Odometry", odometry(START + k / 10, pose),
+                      START + k / 10)  # fmt: skip
         for k, entry in enumerate(detections):
             for topic in topics:
                 bag.write(topic, TYPE, detections_to_ros(entry), START + k / 10)
     return folder
+
+
+def odometry(stamp: float, pose: Array) -> Any:
+    """A message of where wheels think that the body is."""
+    make = message_class
+    x, y, theta = pose.tolist()
+    turned = make("geometry_msgs/msg/Quaternion")(0.0, 0.0, np.sin(theta / 2), np.cos(theta / 2))
+    at = make("geometry_msgs/msg/Pose")(make("geometry_msgs/msg/Point")(x, y, 0.0), turned)
+    still = make("geometry_msgs/msg/Vector3")(0.0, 0.0, 0.0)
+    twist = make("geometry_msgs/msg/Twist")(still, still)
+    unknown = np.zeros(36)
+    return make("nav_msgs/msg/Odometry")(
+        header(stamp, "odom"),
+        "limo/base_link",
+        make("geometry_msgs/msg/PoseWithCovariance")(at, unknown),
+        make("geometry_msgs/msg/TwistWithCovariance")(twist, unknown),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -171,6 +193,30 @@ def test_the_way_is_that_of_what_the_camera_is_mounted_on(
     x, y, z, w = rows[:, 4:].T
     forward = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y + w * z)], axis=1)
     assert ((forward * R_WC[:, :2, 2]).sum(axis=1) > 0.999).all()  # B's x is the sight's direction
+
+
+def test_wheels_smooth_the_way_if_asked(
+    tagtrail: Callable[..., Any], refuse: Refuse, recording: Path, world: Circuit, tmp_path: Path
+) -> None:
+    true_map(world, *range(24)).save(tmp_path / "map.json")
+    R_WB = world.scene.R_CW.swapaxes(1, 2) @ X_BC.rotation().matrix().T
+    p_WB = world.scene.positions() - R_WB @ X_BC.translation()
+    wheels = np.column_stack([p_WB[:, :2], np.arctan2(R_WB[:, 1, 0], R_WB[:, 0, 0])])
+    few = [d.select(np.arange(len(d)) == k % len(d)) for k, d in enumerate(seen(world))]
+    bag = record(tmp_path / "bag", few, mounted=True, wheels=wheels)
+    known = ("--map", tmp_path / "map.json", "--localize-only", "--no-meshcat")
+    off = []
+    for arguments in ((), ("--odometry", "/limo/odom")):
+        assert tagtrail("map", bag, *known, *arguments, "--out", tmp_path / "M").status == 0
+        rows = tum(tmp_path / "M" / "trajectory.tum")
+        frames = np.rint(10 * (rows[:, 0] - START)).astype(int)
+        off.append(np.linalg.norm(rows[:, 1:4] - p_WB[frames], axis=1).mean())
+    assert off[1] < off[0]
+    line = refuse("map", recording, *known, "--odometry", "/odom", "--out", tmp_path / "M")
+    assert line == f"--odometry /odom: recording {recording} has none"
+    bare = record(tmp_path / "bare", few, wheels=wheels)
+    line = refuse("map", bare, *known, "--odometry", "/limo/odom", "--out", tmp_path / "M")
+    assert "/tf_static does not say where the camera is on the body" in line
 
 
 def test_without_an_anchor_the_tag_seen_most_is_the_origin(
@@ -446,3 +492,21 @@ def test_a_folder_of_pictures_is_mapped(tagtrail: Callable[..., Any], tmp_path: 
         assert off.rotation().ToAngleAxis().angle() < np.radians(0.5)
     assert report_of(out)["metrics"]["frames"] == 6
     assert tum(out / "trajectory.tum")[:, 0].tolist() == list(range(6))
+
+
+def test_recorded_pictures_and_recorded_detections_give_the_same_map(
+    tagtrail: Callable[..., Any], rendered: Any, tmp_path: Path
+) -> None:
+    maps = []
+    for name, topic in (("pictures", "image/compressed"), ("detections", "detections")):
+        out = tmp_path / name
+        result = tagtrail("map", rendered.bag, "--family", "4x4_50", "--size", 0.15, "--anchor", 10,
+                          "--topic", f"/robot/front_camera/{topic}", "--out", out,
+                          "--no-meshcat")  # fmt: skip
+        assert result.status == 0, result
+        assert report_of(out)["map"]["trajectory_of"] == "robot/base_link"
+        maps.append(load_map(out / "map.json"))
+    assert sorted(maps[0].markers) == sorted(maps[1].markers)
+    for marker in maps[0]:
+        other = maps[1].markers[marker.id].X_WM
+        assert np.linalg.norm(marker.X_WM.translation() - other.translation()) < 1e-3
