@@ -184,16 +184,15 @@ def supervise(
     near = view.free <= p.stop_distance + _NEAR
     if near:
         memory = memory._replace(blocked=now)
-    fading = min(
-        _left(age, p.slow_after, p.stop_after, p.slowest),
-        _left(view.radius, p.slow_radius, p.stop_radius, p.slowest),
-    )
+    sure = _left(view.radius, p.slow_radius, p.stop_radius, p.slowest)
+    fading = min(_left(age, p.slow_after, p.stop_after, p.slowest), sure)
     braking = math.sqrt(2 * p.deceleration * max(free - p.stop_distance, 0.0))
     room = min(1.0, braking / abs(view.speed)) if view.speed else 1.0
     holds = {
         "waiting": not view.known,
         "arrived": view.arrived,
-        "lost": fading == 0.0,
+        # What stands in the way may hide the tags too: a robot that waits for it knows where it is.
+        "lost": fading == 0.0 and not (near and sure > 0.0),
         "doubtful": view.refused - memory.refused >= p.refusals,
         "relocalised": now - memory.restarted < p.settle_time,
         "off_route": view.distance > p.off_route,
