@@ -103,7 +103,7 @@ class TeachReplayScenario(TeachScenario, ReplayKeys):
         if meshcat is not None:  # what teaching has left there
             meshcat.DeleteAddedControls()
             meshcat.DeleteRecording()
-            meshcat.Delete()
+            meshcat.Delete("/drake")
         return ready
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:

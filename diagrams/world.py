@@ -180,9 +180,12 @@ class WorldParameters(World):
         return replace(believed, markers=markers)
 
     def view(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Returns a place to the south of the arena and above, and its middle."""
-        walls = self.arena.walls
-        ends = np.array([e for wall in walls for e in (wall.start, wall.end)] or [[-1, -1], [1, 1]])
+        """Returns a place to the south of walls or markers and above, and their middle."""
+        ends = np.array([e for wall in self.arena.walls for e in (wall.start, wall.end)])
+        if len(ends) == 0:  # in the open the markers say where it is
+            ends = np.array([tag.X_WM.translation()[:2] for tag in self.marker_map()])
+        if len(ends) < 2:
+            ends = np.array([[-1.0, -1.0], [1.0, 1.0]])
         middle, extent = (ends.max(axis=0) + ends.min(axis=0)) / 2, np.ptp(ends, axis=0).max()
         eye = np.array([middle[0], middle[1] - 0.55 * extent, 0.75 * extent])
         return eye, np.array([*middle, 0.0])
