@@ -29,6 +29,7 @@ _ITERATIONS = 25
 _SIGMAS = 6.0
 _FACTORS = (0.5, 0.7, 0.8, 0.9, 1.1, 1.25, 1.4, 2.0)  # of focal lengths that are tried
 _FITS = 0.5  # of the misfit, at most, is left where one of them is right
+_LEFT = 1.0  # px, of corners that the right camera explains, at most
 _EXPLAINS = 0.1  # of the cost, at least, goes where something was told wrong
 _HARMLESS = 0.01  # of the focal length, and of sizes
 _HARMLESS_PX = 2.5  # of the distortion, RMS over the corners: lenses are not quite as modelled
@@ -48,6 +49,7 @@ class Freed:
         new_size: true size of new tags by the given one; (1, inf) without known tags.
         known_size: the same of known tags.
         explained: part of the robust cost that freeing all this takes away.
+        left: what is left of it, as the RMS distance of a corner, px.
     """
 
     focal: tuple[float, float]
@@ -56,6 +58,7 @@ class Freed:
     new_size: tuple[float, float]
     known_size: tuple[float, float]
     explained: float
+    left: float
 
 
 def free_camera(
@@ -113,6 +116,7 @@ def free_camera(
         (float(np.exp(values[2])), deviation[2]),
         (float(np.exp(values[3])), deviation[3]),
         1 - system.cost / max(before, 1e-300),
+        float(np.sqrt(system.cost / (4 * max(len(seen), 1)))) * pixel_noise,
     )
 
 
@@ -155,7 +159,10 @@ def suspect_camera(
         sizes=sizes,
     )
     freed = replace(freed, focal=(freed.focal[0] * scale, freed.focal[1]))
-    if scale == 1.0 and freed.explained < _EXPLAINS:
+    bad = {"residuals", "outliers"} & tag_map.suspects.keys()
+    if scale == 1.0 and freed.explained < (1 - _FITS if bad else _EXPLAINS):
+        return freed, {}
+    if freed.left > _LEFT:  # something else is wrong, and the camera would be blamed for it
         return freed, {}
     return freed, doubts(freed, camera)
 

@@ -22,6 +22,7 @@ from systems.mapping.sightings import Sightings
 from systems.markers.layout import marker_corners
 from systems.markers.planar_pose import closed_form
 from systems.markers.pnp import refine, squared_errors
+from systems.validation import require
 
 Array = NDArray[np.float64]
 Indices = NDArray[np.intp]
@@ -82,8 +83,17 @@ def find_start(sightings: Sightings, *, known: Mapping[int, RigidTransform]) -> 
     Args:
         sightings: of tags in frames.
         known: number to pose of the tags whose pose is known (the anchor, or several).
+
+    Raises:
+        ValueError: no known tag was seen as a square is seen from its front.
     """
     good, R, p = closed_form(sightings.rays, sightings.sizes[sightings.tag])
+    require(
+        bool(np.isin(sightings.tag[good], list(known)).any()),
+        "corners",
+        "those of no square seen from its front",
+        "in the order top-left, top-right, bottom-right, bottom-left",
+    )
     seen = sightings.select(good)
     poses, trust = _refined(R, p, seen)
     side = _sides(seen)

@@ -60,7 +60,7 @@ def _beside_gtsam(what: str, whole: float) -> Iterator[Row]:
     yield Row(f"{what}: all with outliers and flips", f"{whole:.1f} s", "", None,
               f"the start alone: {to_start:.1f} s")  # fmt: skip
     if importlib.util.find_spec("gtsam") is None:
-        yield Row(f"{what}: adjusted", told, "", None, "GTSAM is not there: pip install .[bench]")
+        yield Row(f"{what}: adjusted", told, "", None, "GTSAM is not there: pip install gtsam")
         return
     from tests.benchmarks.gtsam_mapping import solve
 

@@ -1,7 +1,7 @@
 """The peer of our adjustment: GTSAM with a `CustomFactor` written in Python for each sighting.
 
 The same unknowns, residuals, noise and robust cost as `systems.mapping.adjustment`, from the same
-start. GTSAM is no dependency; the extra `bench` brings it.
+start. GTSAM is needed for this and for tests alone.
 """
 
 from __future__ import annotations

@@ -151,6 +151,8 @@ def test_a_recording_becomes_a_map(
     assert metrics["corners_used_fraction"] == 1.0
     assert metrics["chi2_per_dof"] == pytest.approx(1.0, abs=0.1)
     assert report["solve_seconds"] > 0
+    assert report["camera"]["focal_length_px"] == 480.0
+    assert report["camera"]["focal_length_freed_px"] == pytest.approx(480.0, abs=3.0)
     assert not any(n for counts in report["health"].values() for n in counts.values())
     assert error(found, world) < 4 * metrics["tag_sigma_max_m"]
     assert report["tags"][0] == {

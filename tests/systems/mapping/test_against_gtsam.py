@@ -9,7 +9,7 @@ from systems.mapping.adjustment import adjust, robust_cost
 from systems.mapping.sightings import Sightings
 from tests.mapping_world import circuit
 
-pytest.importorskip("gtsam", reason="the extra `bench` brings it")
+pytest.importorskip("gtsam", reason="GTSAM is not installed")
 
 
 @pytest.mark.parametrize("spoiled", [False, True])

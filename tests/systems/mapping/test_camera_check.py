@@ -61,6 +61,20 @@ def test_a_distortion_that_is_not_there_is_named() -> None:
     assert k1 == pytest.approx(0.0, abs=0.01)
 
 
+def test_the_camera_is_not_blamed_for_tags_that_sway() -> None:
+    swaying = []
+    for k, d in enumerate(SEEN):
+        aside = 25.0 * (d.ids % 2) * (k % 2)  # px
+        swaying.append(replace(d, corners=d.corners + aside[:, None, None]))
+
+    def remap(camera: PinholeCamera) -> TagMap:
+        return build_map(gather(swaying, camera=camera, size=SIZE))
+
+    tag_map = remap(CAMERA)
+    assert tag_map.suspects
+    assert suspect_camera(tag_map, CAMERA, remap=remap)[1] == {}
+
+
 def test_sizes_are_told_by_known_tags() -> None:
     odd = dict.fromkeys(range(1, 24, 2), 1.25 * SIZE)
     found = suspected(CAMERA, tags=known(*range(0, 24, 2)), sizes=odd)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RotationMatrix
@@ -148,6 +150,24 @@ def test_against_a_whole_map_only_cameras_are_found() -> None:
     )
     nees = (error * np.linalg.solve(P, error[..., None])[..., 0]).sum(axis=1) / 6
     assert nees.mean() == pytest.approx(1.0, abs=0.15)
+
+
+def test_corners_in_another_order_are_refused() -> None:
+    turned = [replace(d, corners=d.corners[:, ::-1]) for d in circuit().detections(0.3)]
+    gathered = gather(turned, camera=CAMERA, size=SIZE)
+    with pytest.raises(ValueError, match=r"corners is .*: must be in the order top-left, top-ri"):
+        build_map(gathered)
+
+
+@pytest.mark.parametrize("ids", [[7], [7, 8]])
+def test_few_tags_are_a_map_too(ids: list[int]) -> None:
+    world = circuit()
+    found = [d.select(np.isin(d.ids, ids)) for d in world.detections(0.3)]
+    tag_map = build_map(gather(found, camera=CAMERA, size=SIZE), anchor=7)
+    assert tag_map.ids.tolist() == ids
+    distance = np.linalg.norm(np.diff(tag_map.adjustment.scene.p_WT, axis=0), axis=1)
+    true = np.linalg.norm(np.diff(world.scene.p_WT[ids], axis=0), axis=1)
+    np.testing.assert_allclose(distance, true, atol=0.05)
 
 
 def test_known_tags_must_be_among_those_seen() -> None:
