@@ -1,4 +1,4 @@
-"""Mapping: the real recording beside TagSLAM and GTSAM, and known circuits."""
+"""Mapping: the real recording beside TagSLAM and GTSAM."""
 
 from __future__ import annotations
 
