@@ -23,7 +23,7 @@ from diagrams.mission import FRAME_RATE, Mission, Wiring
 from diagrams.scenario import Scenario
 from diagrams.station import RobotParameters
 from diagrams.teach_log import TeachLog
-from diagrams.teach_mission import write_cameras
+from diagrams.teach_mission import LOOKS, write_cameras
 from diagrams.teach_recording import tag_transforms_signal
 from diagrams.world import WorldParameters
 from systems.mapping.tag_frames import TagFrames
@@ -112,7 +112,10 @@ class TagFramesMission(Mission):
         known = wiring.station.marker_map
         wiring.add(
             TagFrames(
-                camera=sensor.model(), markers=known, anchor=min(known.markers), rate=sensor.rate
+                camera=sensor.model(),
+                markers=known,
+                anchor=min(known.markers),
+                rate=LOOKS * sensor.rate,
             ),
             "frames",
         )
