@@ -91,7 +91,7 @@ def test_a_missing_map_is_refused(refuse: Refuse, workshop: Path) -> None:
     path = scene(workshop, "world: {markers: my_map.json}\n")
     assert refuse("run", path) == (
         f"{path}:3: world.markers is 'my_map.json': no such file in {workshop} or "
-        f"{ROOT / 'diagrams' / 'scenarios'}; bundled: navigation.json, snailbot.json"
+        f"{ROOT / 'diagrams' / 'scenarios'}; bundled: circuit.json, navigation.json, snailbot.json"
     )
 
 
@@ -272,7 +272,7 @@ def test_markers_of_a_bundled_map_become_a_pdf(
 
 def test_markers_that_cannot_be_printed_are_refused(refuse: Refuse, workshop: Path) -> None:
     assert refuse("markers", "nope.json") == (
-        "marker map nope.json: no such file; bundled: navigation.json, snailbot.json"
+        "marker map nope.json: no such file; bundled: circuit.json, navigation.json, snailbot.json"
     )
     assert refuse("markers", "navigation.json", "--page", "A7").startswith("page is 'A7': unknown")
     assert refuse("markers", "navigation.json", "-o", "nowhere/x.pdf") == (

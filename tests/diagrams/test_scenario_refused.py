@@ -73,9 +73,9 @@ def refusal(path: Path | str, overrides: Any = ()) -> str:
         ("estimator.gate=-1", "--set estimator.gate: estimator.gate is -1.0: must be greater than "
                               "0"),
         ("robot.body=car", "--set robot.body: robot.body is 'car': no such body; known: "
-                           "differential_drive, snailbot (or 'module:Class')"),
+                           "differential_drive, limo, snailbot (or 'module:Class')"),
         ("robot.body.type=car", "--set robot.body.type: robot.body.type is 'car': no such body; "
-                                "known: differential_drive, snailbot (or 'module:Class')"),
+                                "known: differential_drive, limo, snailbot (or 'module:Class')"),
         ("a.b.c=3", "--set a.b.c: a: unknown key; known: "),
         ("world.markers=nope.json", "--set world.markers: world.markers is 'nope.json': no such "
                                     "file in "),

@@ -168,7 +168,8 @@ def test_a_file_lies_beside_the_scenario_or_is_bundled(tmp_path: Path) -> None:
     assert convert("mine.json", hint, place) == str((tmp_path / "mine.json").resolve())
     assert convert("navigation.json", hint, place) == str((tmp_path / "navigation.json").resolve())
     assert complaint("nope.json", hint, place) == (
-        f"map is 'nope.json': no such file in {tmp_path}; bundled: navigation.json, snailbot.json"
+        f"map is 'nope.json': no such file in {tmp_path}; bundled: circuit.json, navigation.json, "
+        "snailbot.json"
     )
     assert complaint(7, hint, place) == "map is 7: must be text"
 

@@ -146,3 +146,24 @@ def test_quaternions_that_are_none_are_refused(q):
 def test_nothing_measured_is_no_message():
     with pytest.raises(ValueError, match="time is nan"):
         ros_motion.estimate_to_ros(PoseEstimate())
+
+
+def test_odometry_survives_both_ways():
+    pose, velocity = np.array([1.5, -2.0, 2.8]), np.array([0.3, -0.2])
+    covariance = random_covariance(3)
+    message = over_the_wire(
+        ros_motion.odometry_to_ros(
+            pose, covariance, velocity, stamp=2.25, child_frame_id="limo/base_link"
+        )
+    )
+    assert message.__msgtype__ == "nav_msgs/msg/Odometry"
+    assert (message.header.frame_id, message.child_frame_id) == ("odom", "limo/base_link")
+    assert (message.header.stamp.sec, message.header.stamp.nanosec) == (2, 250_000_000)
+    found = ros_motion.odometry_from_ros(message)
+    for value, expected in zip(found, (pose, covariance, velocity), strict=True):
+        np.testing.assert_allclose(value, expected, atol=1e-12)
+    # In ROS the position comes first, and the heading is a turn about z.
+    full = np.asarray(message.pose.covariance).reshape(6, 6)
+    assert full[5, 5] == covariance[2, 2]
+    assert full[0, 5] == covariance[0, 2]
+    assert message.twist.twist.angular.z == -0.2
