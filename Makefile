@@ -26,6 +26,7 @@ validate: $(READY) renderer  ## runs what needs the real recordings, and the slo
 	$(RUN)python -m tests.benchmarks.validate_robot
 	$(RUN)python -m tests.benchmarks.validate_formation
 	$(RUN)python -m tests.benchmarks.validate_mapping
+	$(RUN)python -m tests.benchmarks.validate_replay
 
 $(READY): pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -272,10 +272,10 @@ class Drive:
     diagram: Diagram
     parts: dict[str, LeafSystem] = field(default_factory=dict)
 
-    def cross_track(self, route: Route, after: float = 0.0) -> Array:
-        """How far the true robot was left of the route, m."""
+    def cross_track(self, route: Route, after: float = 0.0, every: int = 1) -> Array:
+        """How far the true robot was left of the route, m, at each tick or some."""
         offsets, near = [], None
-        for pose in self.pose[self.t >= after]:
+        for pose in self.pose[self.t >= after][::every]:
             place = route.closest(pose, near=near, window=1.0)
             near = place.time
             offsets.append(math.copysign(place.distance, place.offset))

@@ -111,7 +111,7 @@ class Route:
     def __len__(self) -> int:
         return len(self.t)
 
-    @property
+    @cached_property
     def step(self) -> float:
         """Time from one sample to the next, s."""
         return float((self.t[-1] - self.t[0]) / (len(self.t) - 1))

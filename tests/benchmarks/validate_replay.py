@@ -129,7 +129,7 @@ def _laps(name: str, truth: Truth) -> list[Lap]:
 def _lap(seed: int, *, name: str, truth: Truth) -> Lap:
     world = circuit(seed)
     drive = replay(world, TRACKERS[name](route=world.route), truth=truth, seed=seed)
-    off = drive.cross_track(world.route)
+    off = drive.cross_track(world.route, every=5)
     return Lap(
         float(np.sqrt(np.mean(off**2))), float(np.abs(off).max()), float(drive.nees().mean()),
         float(drive.nis.mean()) if len(drive.nis) else float("nan"),
