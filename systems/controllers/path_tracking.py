@@ -291,20 +291,14 @@ class PathTracker(LeafSystem):
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         pose = self._pose_input.Eval(context)
         before = context.get_discrete_state(self._command).get_value()
-        if self._sent_input.HasValue(context):
-            sent = self._sent_input.Eval(context)
-            if np.isfinite(sent).all():
-                before = sent
-            else:
-                self._counts.add(context, discrete_state, bad_sent=1)
+        sent = self._sent_input.Eval(context) if self._sent_input.HasValue(context) else before
+        bad_pose, bad_sent = not np.isfinite(pose).all(), not np.isfinite(sent).all()
+        self._counts.add(context, discrete_state, bad_pose=bad_pose, bad_sent=bad_sent)
+        before = before if bad_sent else sent
+        if bad_pose or not self._covariance_input.Eval(context)[0] < UNKNOWN:
+            discrete_state.set_value(self._command, np.zeros(2))
+            return
         old = Progress(*context.get_discrete_state(self._progress).get_value().tolist())
-        if not np.isfinite(pose).all():
-            self._counts.add(context, discrete_state, bad_pose=1)
-            discrete_state.set_value(self._command, np.zeros(2))
-            return
-        if not self._covariance_input.Eval(context)[0] < UNKNOWN:
-            discrete_state.set_value(self._command, np.zeros(2))
-            return
         pose = driven(pose, before, self._limits.delay)
         if math.isnan(old.place):
             progress = begin(self._route, pose)

@@ -173,6 +173,9 @@ def test_what_is_not_finite_stops_it_and_is_counted() -> None:
     counts = rig.tracker.health_output_port().Eval(rig.context).counts
     assert counts["bad_pose"] == 3
     assert counts["bad_sent"] == 3
+    rig.after(0.86, [math.nan, 0.0, 0.0], sent=[math.inf, 0.0])
+    counts = rig.tracker.health_output_port().Eval(rig.context).counts
+    assert (counts["bad_pose"], counts["bad_sent"]) == (5, 5)
 
 
 def test_a_delay_is_foreseen() -> None:
