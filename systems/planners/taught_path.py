@@ -21,6 +21,7 @@ _JUMP = 0.5  # m between two samples
 _CLOSING = 0.5  # m; a path that comes back so near its beginning is closed
 _AWAY = 1.5  # m, to be gone before it can come back
 _SAME_WAY = math.radians(60.0)
+_WEIGHTS = np.array([1.0, 2.0, 3.0, 2.0, 1.0]) / 9.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,7 @@ class TaughtPath:
 
 
 def taught_path(t: Array, poses: Array, closed: bool | None = None) -> TaughtPath:
-    """Returns the path of a trajectory.
+    """Returns the path of a trajectory, without what noise adds to it within a few points.
 
     Args:
         t: (n,) s, ascending.
@@ -114,9 +115,31 @@ def taught_path(t: Array, poses: Array, closed: bool | None = None) -> TaughtPat
     line = poses[:, :2]
     if end is not None:
         line = _closed(line)
+    line = _smooth(_even(line, end is not None), end is not None)
+    # Noise has made the way longer: once more in equal steps.
+    line = np.vstack([line, line[:1]]) if end is not None else line
+    return TaughtPath(_even(line, end is not None), end is not None, cut)
+
+
+def _even(line: Array, closed: bool) -> Array:
+    """Returns points (k, 2) at equal steps along a line; of a closed one without its end."""
     count = round(length_of(line) / STEP)
-    share = np.arange(count if end is not None else count + 1) / count
-    return TaughtPath(points_along(line, length_of(line) * share), end is not None, cut)
+    share = np.arange(count if closed else count + 1) / count
+    return points_along(line, length_of(line) * share)
+
+
+def _smooth(points: Array, closed: bool) -> Array:
+    """Returns points averaged with their neighbours; what is finer than that is noise."""
+    reach = len(_WEIGHTS) // 2
+    around = (
+        np.vstack([points[-reach:], points, points[:reach]])
+        if closed  # beyond an open end lies what it is the middle of
+        else np.vstack([
+            2 * points[0] - points[reach:0:-1], points, 2 * points[-1] - points[-2:-2 - reach:-1]
+        ])
+    )  # fmt: skip
+    columns = [np.convolve(around[:, k], _WEIGHTS, "valid") for k in (0, 1)]
+    return np.stack(columns, axis=1)
 
 
 def _lap(poses: Array, steps: Array) -> int | None:
