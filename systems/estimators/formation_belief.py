@@ -30,6 +30,7 @@ from systems.estimators.formation_model import (
     Layout,
     SightingModel,
     Sightings,
+    mean_values,
     variances,
 )
 from systems.estimators.formation_start import guess
@@ -263,7 +264,7 @@ class FormationEstimator:
         rows[rows[:, _LASTING] != lasting, _FRAMES] = 0.0
         rows[:, _LASTING] = lasting
         rows[:, _FRAMES] += 1
-        rows[:, _VALUES] += (values[inside] - rows[:, _VALUES]) / rows[:, :1]
+        rows[:, _VALUES] = mean_values(rows[:, _VALUES], values[inside], rows[:, _FRAMES])
         belief.memory[where] = rows
 
     def _inside_gate(self, belief: Belief, seen: Sightings) -> Mask:

@@ -89,8 +89,11 @@ class Sightings(NamedTuple):
 def measure(detections: Detections, camera: PinholeCamera, marker_size: float) -> Array:
     """Returns bearings and logarithms of distances of detected markers.
 
-    The centre is where the diagonals cross, which perspective keeps. Each upright edge tells its
-    own depth by its height, and the centre's is the mean of both, however the marker is turned.
+    The centre is where the diagonals cross, which perspective keeps. The mean height of the upright
+    edges tells the mean of their reciprocal depths, and the width how much one of them is nearer
+    than the other: both together give the centre's depth, however the marker is turned. Each edge's
+    own height would give it too, but that makes squares of their noise, which all lengthen the
+    distance: by 1.5 (s / h)^2 for noise s in a height of h, at 12 px with 0.3 px by 4 mm in 4 m.
 
     Args:
         detections: markers in one picture of a level camera at their height.
@@ -109,13 +112,37 @@ def measure(detections: Detections, camera: PinholeCamera, marker_size: float) -
         tangent = a[:, 0] + share * (c - a)[:, 0]
         heights = np.stack([d - a, c - b])[..., 1]
         heights[~(heights > 0)] = math.nan
-        depth = marker_size * (1 / heights).mean(axis=0)
-        # The logarithm of a noisy height leans to far: by half its relative variance, which is
-        # below 0.1 % here, and left.
+        nearness = heights.mean(axis=0) / marker_size
+        across = ((b + c) - (a + d))[:, 0] / 4 / nearness
+        # The half marker is across + tangent lean to the right and lean ahead.
+        secant = 1 + tangent**2
+        root = np.sqrt(np.maximum(secant * marker_size**2 / 4 - across**2, 0.0))
+        leans = (np.stack([root, -root]) - across * tangent) / secant
+        apart = np.abs(leans - marker_size * (1 / heights[1] - 1 / heights[0]) / 2)
+        lean = np.where(apart[0] < apart[1], *leans)
+        depth = (1 + np.hypot(1.0, 2 * nearness * lean)) / (2 * nearness)
         bearing = -np.arctan(tangent)
         values = np.column_stack([bearing, np.log(depth / np.cos(bearing))])
     values[~np.isfinite(values).all(axis=1)] = math.nan
     return values
+
+
+def mean_values(mean: Array, values: Array, frames: Array) -> Array:
+    """Returns the means (n, 2) of sightings over some pictures, taking one more picture in.
+
+    Bearings are averaged as they are, distances by their reciprocals: heights of markers have
+    errors about zero, the logarithms that are made of them have not. The mean of those would be too
+    far by half the relative variance of one picture's.
+
+    Args:
+        mean: (n, 2) as in `Sightings`, over the pictures so far.
+        values: (n, 2) of the new picture.
+        frames: (n,) pictures, the new one included.
+    """
+    result = mean + (values - mean) / frames[:, None]
+    # By how much, relatively, the reciprocal of the mean's distance changes.
+    result[:, 1] = mean[:, 1] - np.log1p(np.expm1(mean[:, 1] - values[:, 1]) / frames)
+    return result
 
 
 def variances(
@@ -124,7 +151,7 @@ def variances(
     """Returns the variances of sightings that are means over some pictures: (n, 2).
 
     White noise s of each corner coordinate is s sqrt(2) in the height h of an edge, thus s / h,
-    relatively, in the mean of two depths. Where the diagonals cross it is sqrt(1 + (w / h)^2) s/2
+    relatively, in the mean of both. Where the diagonals cross it is sqrt(1 + (w / h)^2) s/2
     for a marker of width w: from 1 to sqrt(2) times s/2. A sighting does not tell the width; the
     mean of the variances is taken.
 

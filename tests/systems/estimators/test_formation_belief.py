@@ -127,7 +127,7 @@ def test_a_false_bearing_between_robots_that_stand_is_refused() -> None:
     counts = estimator.look(belief, 0.2, looks)
     assert counts["accepted"] == 0
     assert counts["gated"] == sum(len(look.markers) for look in looks) > 5
-    np.testing.assert_allclose(belief.x, before, atol=1e-9)
+    np.testing.assert_allclose(belief.x, before, atol=1e-8)  # it goes on from where it was
 
 
 def test_a_hidden_robot_only_has_fewer_sightings() -> None:

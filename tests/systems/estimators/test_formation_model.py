@@ -13,11 +13,13 @@ from systems.estimators.formation_model import (
     Layout,
     Sightings,
     jacobian,
+    mean_values,
     measure,
     predict,
     residuals,
     variances,
 )
+from systems.messages import Detections
 from tests.formation_world import CAMERA, FRONT_AND_REAR, OFFSET, SIZE, FormationWorld
 
 LAYOUT = Layout(4, FRONT_AND_REAR, OFFSET)
@@ -117,6 +119,28 @@ def test_means_over_pictures_lose_the_white_noise_only() -> None:
     one, many = (variances(values, np.array([float(n)]), **terms)[0] for n in (1, 100))
     floor = np.square([0.001, 0.003])
     np.testing.assert_allclose((one - floor) / (many - floor), 100.0)
+
+
+def test_distances_of_small_markers_are_right_in_the_mean() -> None:
+    """12 px high, noise of 0.6 px: a mean of logarithms is too far, that of depths more still."""
+    rng = np.random.default_rng(3)
+    high = 12.0
+    size = 4.0 * high / CAMERA.K[0, 0]  # 4 m ahead
+    u, v = CAMERA.K[0, 2], CAMERA.K[1, 2]
+    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * high / 2 + [u, v]
+    markers, frames = 200, 100
+    noisy = square + rng.normal(0.0, 0.6, (frames, markers, 4, 2))
+    ids = np.arange(markers)
+    pictures = [measure(Detections(ids=ids, corners=each), CAMERA, size) for each in noisy]
+    mean = np.full((markers, 2), 7.0)  # of no picture yet: does not matter
+    for k, values in enumerate(pictures):
+        mean = mean_values(mean, values, np.full(markers, k + 1.0))
+    said = np.exp(mean[:, 1]).mean() / 4.0
+    assert abs(said - 1.0) < 1e-3  # three times the standard deviation of the mean
+    assert np.exp(np.mean(pictures, axis=0)[:, 1]).mean() / 4.0 > 1.001
+    heights = noisy[..., 3, 1] - noisy[..., 0, 1], noisy[..., 2, 1] - noisy[..., 1, 1]
+    assert np.mean([high / each for each in heights]) > 1.004
+    np.testing.assert_allclose(mean[:, 0], np.mean(pictures, axis=0)[:, 0], atol=1e-12)
 
 
 def test_corners_that_make_no_upright_marker_are_not_measured() -> None:
