@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.WARNING, format="tagtrail: %(message)s")
     logging.getLogger("drake").setLevel(logging.WARNING)
+    logging.getLogger("systems.compiled").setLevel(logging.INFO)  # why the first run waits
     try:
         return int(options.function(options))
     except ValueError as error:

@@ -56,7 +56,7 @@ def prepare() -> None:
         function.compile(signature)
         if function.stats.cache_misses and not told:
             told = True
-            _log.warning("compiling %d small loops, once on this machine", len(_WAITING) + 1)
+            _log.info("compiling %d small loops, once on this machine", len(_WAITING) + 1)
 
 
 def packed(values: NDArray[np.float64]) -> NDArray[np.float64]:
