@@ -2,9 +2,9 @@
 
     world: {random: {length: 15, tags: 24}}
 
-The keys are those of `plants.circuit.CircuitParameters`. Tags, ground, `route` and the robot's
-start become plain keys; see `diagrams.random_world`. What the camera sees is what the scenario's
-own camera sees, unless `camera` says otherwise.
+The keys are those of `plants.circuit_parameters.CircuitParameters`. Tags, ground, `route` and the
+robot's start become plain keys; see `diagrams.random_world`. What the camera sees is what the
+scenario's own camera sees, unless `camera` says otherwise.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import numpy as np
 
 from diagrams.random_world import RandomWorld, plain_markers
 from diagrams.schema import Place, convert, file_path
-from plants.circuit import CircuitParameters, circuit
+from plants.circuit import circuit
+from plants.circuit_parameters import CircuitParameters
 from systems.cameras import load_camera
 
 

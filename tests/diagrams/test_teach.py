@@ -21,7 +21,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 
 from diagrams.run import simulate
 from diagrams.scenario import load_scenario
-from plants.circuit import CircuitCamera, CircuitParameters, in_view
+from plants.circuit import in_view
+from plants.circuit_parameters import CircuitCamera, CircuitParameters
 from systems.cameras import load_camera
 from systems.io.bag import BagReader
 from systems.io.ros_motion import estimate_from_ros, odometry_from_ros, transforms_from_ros
