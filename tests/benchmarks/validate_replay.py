@@ -80,7 +80,7 @@ def tracking_rows() -> Iterator[Row]:
             )
         nees, nis = np.mean(consistent, axis=0)
         yield Row(f"{what}: NEES and NIS per dimension", f"{nees:.2f}, {nis:.2f}",
-                  "0.6 to 1.25", bool(0.6 <= nees <= 1.25 and 0.6 <= nis <= 1.25))  # fmt: skip
+                  "0.8 to 1.25", bool(0.8 <= nees <= 1.25 and 0.8 <= nis <= 1.25))  # fmt: skip
 
 
 def odometry_rows() -> Iterator[Row]:
