@@ -20,10 +20,13 @@ from diagrams.metrics import PoseLog, nis_mean, path_length, pose_metrics
 from diagrams.mission import FRAME_RATE, Mission, Wiring
 from diagrams.replay_log import ReplayLog, replay_metrics
 from diagrams.replay_viewer import show_route
+from diagrams.tables import Choice
 from diagrams.trajectories import write_tum
 from diagrams.viewer import EstimateViewer
 from systems.angles import spatial_pose
+from systems.controllers.path_tracking import TrackingParameters
 from systems.controllers.replay_supervisor import STATUSES, ReplaySupervisor
+from systems.controllers.wheel_drive import WheelDriveParameters
 from systems.estimators.planar_kalman import UNKNOWN
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.io.ros_types import message_class
@@ -39,6 +42,7 @@ if TYPE_CHECKING:
 
 ROBOT = "limo"
 _RATE = 20.0  # Hz, of tracker and supervisor unless the scenario says otherwise
+_AFTER = 0.001  # s, by which the supervisor looks later than the tracker
 # Statuses in which a robot that has no time left has failed for that reason.
 _STUCK = ("lost", "doubtful", "off_route", "blind_ahead", "blocked")
 
@@ -91,9 +95,11 @@ class ReplayMission(Mission):
         wiring.add(MarkersSeen(marker_map=self.known, rate=camera.rate, enough=2), "tags_seen")
         wiring.add(scenario.estimator.build(), "estimator")
         wiring.add(scenario.robot.sensors[scenario.encoders].build().speeds(), "wheel_speeds")
-        wiring.add(scenario.controller.build(route=self.route, laps=scenario.laps), "tracker")
+        controller = _within_drive(scenario.controller, scenario.robot.drive.build().parameters)
+        wiring.add(controller.build(route=self.route, laps=scenario.laps), "tracker")
         rate = scenario.controller.arguments.get("rate", _RATE)
-        wiring.add(ReplaySupervisor(parameters=scenario.supervisor, rate=rate), "supervisor")
+        supervisor = ReplaySupervisor(parameters=scenario.supervisor, rate=rate, offset=_AFTER)
+        wiring.add(supervisor, "supervisor")
         if scenario.lidar is not None:
             lidar = scenario.robot.sensors[scenario.lidar].build()
             front, _, half_width = scenario.robot.body.build().hull
@@ -237,6 +243,18 @@ class ReplayMission(Mission):
         self.route.save(out / "route.json")
         self.known.save(out / "map.json")
         plot_replay(out / "summary.png", log, known=self.known)
+
+
+def _within_drive(controller: Choice, drive: WheelDriveParameters) -> Choice:
+    """Returns the tracker with no more speed and acceleration than the drive allows."""
+    own = controller.arguments.get("parameters")
+    if not isinstance(own, TrackingParameters):
+        return controller
+    names = ("max_speed", "max_turn_rate", "max_acceleration", "max_turn_acceleration")
+    limits = {name: min(getattr(own, name), getattr(drive, name)) for name in names}
+    least = max(own.min_speed, -limits["max_speed"])
+    known = replace(own, min_speed=least, **limits)
+    return replace(controller, arguments=controller.arguments | {"parameters": known})
 
 
 def _status(value: np.ndarray, _: float) -> Any:

@@ -235,6 +235,8 @@ class ReplaySupervisor(LeafSystem):
     Args:
         parameters: when to slow, to stop and to go on.
         rate: of the looks, Hz; the tracker's or more.
+        offset: how late in its period it looks, s: behind a tracker of the same rate it would else
+            get each command one period late.
 
     Ports:
         command (input, vector of 2): [v (m/s), omega (rad/s)] of the tracker. One that is not
@@ -260,10 +262,15 @@ class ReplaySupervisor(LeafSystem):
     """
 
     def __init__(
-        self, *, parameters: SupervisorParameters | None = None, rate: float = 20.0
+        self,
+        *,
+        parameters: SupervisorParameters | None = None,
+        rate: float = 20.0,
+        offset: float = 0.0,
     ) -> None:
         super().__init__()
         require_positive(rate=rate)
+        require(0 <= offset < 1 / rate, "offset", offset, f"from 0 to below {1 / rate:g} s")
         self._parameters = parameters or SupervisorParameters()
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._covariance_input = self.DeclareVectorInputPort("covariance", 9)
@@ -278,7 +285,7 @@ class ReplaySupervisor(LeafSystem):
         self._memory = self.DeclareDiscreteState(list(Memory()))
         # Time, status, scale, age of the last sight, radius, free way.
         self._verdict = self.DeclareDiscreteState([math.nan, 0.0, 0.0, math.inf, math.inf, 0.0])
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, offset, self._look)
         self._command_output = self.DeclareStateOutputPort("command", self._command)
         self._state_output = self.DeclareAbstractOutputPort(
             "state",

@@ -8,7 +8,7 @@ import scipy.optimize
 
 from systems.controllers.mpc import Mpc, MpcParameters, Problem, condensed, solve, unlimited
 from systems.controllers.tvlqr import Schedule, Tvlqr, TvlqrParameters, schedule
-from tests.systems.controllers.tracking import circle, closed_loop
+from tests.systems.controllers.tracking import circle, closed_loop, straight
 
 P = MpcParameters()
 Q, R = P.weights()
@@ -121,3 +121,14 @@ def test_it_foresees_that_it_cannot_turn_fast() -> None:
 def test_a_horizon_must_be_a_number_of_commands() -> None:
     with pytest.raises(ValueError, match="horizon"):
         MpcParameters(horizon=0)
+
+
+def test_from_rest_beside_the_route_it_joins_without_overshoot() -> None:
+    """Who knows how slowly it can turn begins to turn back in time."""
+    slow = MpcParameters(max_acceleration=0.3, max_turn_acceleration=2.0)
+    poses, commands, _ = closed_loop(
+        Mpc(route=straight(length=6.0, v=0.5), parameters=slow), (0.0, 0.13, 0.0), 9.0
+    )
+    assert poses[:, 1].min() > -0.015
+    assert np.abs(poses[600:, 1]).max() < 0.005
+    assert np.diff(commands[:, 0]).max() <= 0.3 * 0.05 + 1e-9
