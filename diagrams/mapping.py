@@ -18,6 +18,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from diagrams.mapping_plots import plot_map
 from diagrams.mapping_source import Observed, observe, wheel_odometry
 from diagrams.mapping_viewer import show_map
+from diagrams.report import finite
 from diagrams.schema import ScenarioError
 from diagrams.trajectories import write_poses
 from systems.cameras import PinholeCamera
@@ -208,7 +209,7 @@ def map_recording(
         show_map(meshcat, marker_map, path, observed.X_BC)
         (out / "replay.html").write_text(meshcat.StaticHtml())
     report["wall_seconds"] = time.perf_counter() - started
-    (out / "report.json").write_text(json.dumps(_finite(report), indent=1) + "\n")
+    (out / "report.json").write_text(json.dumps(finite(report), indent=1) + "\n")
     return MappingRun(report, tag_map, path, observed)
 
 
@@ -342,12 +343,3 @@ def _write(
         stamps=path.stamps,
         poses=path.covariance,
     )
-
-
-def _finite(value: Any) -> Any:
-    """Returns JSON data in which what is not finite is null."""
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

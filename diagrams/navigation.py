@@ -131,12 +131,7 @@ class NavigationScenario(Scenario):
             ("lidar", "planar_mounting"),
             ("encoders", "speeds"),
         ):
-            name = getattr(self, key)
-            if name is None:
-                continue
-            fit = [n for n, s in self.robot.sensors.items() if hasattr(s.target, method)]
-            have = ", ".join(fit) or "none"
-            require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
+            self.robot.require_sensor(key, getattr(self, key), method)
         body = self.robot.body
         fits = hasattr(body.target, "hull_radius")
         require(fits, "robot.body", body.type, "one that drives on the ground")

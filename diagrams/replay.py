@@ -82,12 +82,7 @@ class ReplayKeys:
             ("imu", "add"),
             ("lidar", "planar_mounting"),
         ):
-            name = getattr(self, key)
-            if name is None:
-                continue
-            fit = [n for n, s in robot.sensors.items() if hasattr(s.target, method)]
-            have = ", ".join(fit) or "none"
-            require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
+            robot.require_sensor(key, getattr(self, key), method)
         body = robot.body
         require(hasattr(body.target, "sides"), "robot.body", body.type, "one on wheels")
 

@@ -17,6 +17,7 @@ from systems.planners.route import Route
 Array = NDArray[np.float64]
 
 _WINDOW = 1.0  # m along the route, within which the next place is looked for
+_MOVED = 0.005  # m
 _MOVES = STATUSES.index("slowing")  # from this status on the robot drives
 # A robot that begins beside the route has joined it when it believes to be this near, or has come
 # this far, m.
@@ -49,9 +50,17 @@ class ReplayLog:
         return np.asarray(np.where(np.isfinite(self.verdict[:, 0]), self.verdict[:, 1], 0), np.intp)
 
     def on_the_way(self) -> slice:
-        """Returns the samples from the first in which the robot drives to the last."""
-        moves = np.flatnonzero(self.status >= _MOVES)
-        return slice(int(moves[0]), int(moves[-1]) + 1) if len(moves) else slice(0, 0)
+        """Returns the samples from the first in which the robot moves to the last it drives in."""
+        path = self.poses.estimate if self.poses.truth is None else self.poses.truth
+        drives = np.flatnonzero(self.status >= _MOVES)
+        known = np.flatnonzero(self.poses.known)
+        if len(drives) == 0 or len(known) == 0:
+            return slice(0, 0)
+        start = max(int(drives[0]), int(known[0]))
+        away = np.hypot(*(path[start:, :2] - path[start, :2]).T) > _MOVED
+        if not away.any():
+            return slice(0, 0)
+        return slice(max(start + int(np.argmax(away)) - 1, 0), int(drives[-1]) + 1)
 
     def cross_track(self, poses: Array) -> tuple[Array, Array]:
         """Returns how far poses (k, 3), one after the other, are off the route.

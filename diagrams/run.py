@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import json
-import math
 import os
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ from pydrake.systems.analysis import ApplySimulatorConfig, Simulator, SimulatorC
 from pydrake.systems.framework import Context
 
 from diagrams.mission import FRAME_RATE, Mission
+from diagrams.report import finite
 from diagrams.scenario import Scenario, save_scenario
 from systems.compiled import prepare
 from systems.validation import require_non_negative
@@ -121,7 +121,7 @@ def simulate(
     if mission.recorder is not None and mission.recorder.lost:
         report["health"]["recorder"] = {"lost": mission.recorder.lost}
     if out is not None:
-        (out / "report.json").write_text(json.dumps(_finite(report), indent=1) + "\n")
+        (out / "report.json").write_text(json.dumps(finite(report), indent=1) + "\n")
         mission.write(context, out)
         if meshcat is not None:
             meshcat.PublishRecording()
@@ -173,12 +173,3 @@ def _make_folder(out: Path) -> None:
         raise ValueError(f"--out {out}: {error.strerror}") from error
     if not os.access(out, os.W_OK):
         raise ValueError(f"--out {out}: cannot be written to")
-
-
-def _finite(value: Any) -> Any:
-    """Returns JSON data in which what is not finite is null."""
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -148,6 +148,23 @@ class RobotParameters(Hardware):
 
     start: Start = field(default_factory=Start)
 
+    def require_sensor(self, key: str, name: str | None, method: str) -> None:
+        """Refuses a scenario's key that names none of the sensors that fit.
+
+        Args:
+            key: of the scenario, for the message.
+            name: what it says; None, for no sensor, is never refused.
+            method: what the drivers of sensors that fit have.
+
+        Raises:
+            ValueError: naming the key and the sensors that fit.
+        """
+        if name is None:
+            return
+        fit = [own for own, sensor in self.sensors.items() if hasattr(sensor.target, method)]
+        have = ", ".join(fit) or "none"
+        require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
+
 
 @dataclass
 class Robot:

@@ -74,9 +74,7 @@ class TagFramesScenario(Scenario):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        fit = [n for n, s in self.robot.sensors.items() if hasattr(s.target, "mounting")]
-        have = ", ".join(fit) or "none"
-        require(self.camera in fit, "camera", self.camera, f"one of the sensors that fit: {have}")
+        self.robot.require_sensor("camera", self.camera, "mounting")
         require(len(self.world.marker_map()) > 0, "world.markers", "empty", "of tags")
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:

@@ -80,10 +80,7 @@ class TeachScenario(Scenario):
         except ValueError as error:
             raise ValueError(f"route: {str(error).removeprefix('points is ')}") from error
         for key, method in (("camera", "mounting"), ("encoders", "speeds")):
-            name = getattr(self, key)
-            fit = [n for n, s in self.robot.sensors.items() if hasattr(s.target, method)]
-            have = ", ".join(fit) or "none"
-            require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
+            self.robot.require_sensor(key, getattr(self, key), method)
         body = self.robot.body
         require(hasattr(body.target, "sides"), "robot.body", body.type, "one on wheels")
         known = self.world.marker_map()
