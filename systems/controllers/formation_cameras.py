@@ -101,14 +101,17 @@ class FormationCameras(LeafSystem):
         output.SetFromVector([float(looking > 0 and awake > 0)])
 
     def _update(self, context: Context, discrete_state: DiscreteValues) -> None:
-        stamps = context.get_discrete_state(self._stamps).get_value().copy()
-        rested = context.get_discrete_state(self._rested).get_value().copy()
-        for k, port in enumerate(self._detections_inputs):
-            seen: Detections = port.Eval(context)
-            if seen.stamp > stamps[k]:
+        stamps = context.get_discrete_state(self._stamps).get_value()
+        rested = context.get_discrete_state(self._rested).get_value()
+        every = [port.Eval(context) for port in self._detections_inputs]
+        new = [k for k, before in enumerate(stamps.tolist()) if every[k].stamp > before]
+        if new:
+            stamps, rested = stamps.copy(), rested.copy()
+            for k in new:
+                seen: Detections = every[k]
                 stamps[k] = seen.stamp
                 rested[k] = -math.inf if len(seen) else seen.stamp + self._rest
-        discrete_state.set_value(self._stamps, stamps)
-        discrete_state.set_value(self._rested, rested)
+            discrete_state.set_value(self._stamps, stamps)
+            discrete_state.set_value(self._rested, rested)
         awake = context.get_time() >= rested - 1e-9
         discrete_state.set_value(self._active, awake.astype(float))

@@ -125,6 +125,11 @@ def after(
     formation that stands is told of another destination, obstacle or failure, the next move is
     planned.
     """
+    # As it mostly is, while a robot is on its way.
+    if _is_as_before(memory, report) and not _is_broken(
+        memory.vertices, report.positions, lattice, parameters
+    ):
+        return memory
     vertices, wrecks, given_up = dict(memory.vertices), dict(memory.wrecks), memory.given_up
     move = memory.move
     unplaced = report.outcome > 0 and not np.isfinite(report.positions[move.mover]).all()
@@ -176,6 +181,17 @@ def after(
     if under_way or broken or not (changed or move.status in ("waiting", "moving")):
         return kept
     return _planned(kept, report, lattice, parameters, rule)
+
+
+def _is_as_before(memory: Memory, report: Report) -> bool:
+    """Whether a move is under way, and nothing is reported that could end it."""
+    return (
+        memory.move.status == "moving"
+        and report.outcome == 0
+        and report.obstacles is memory.obstacles
+        and not report.failed.any()
+        and np.array_equal(report.destination, memory.destination)
+    )
 
 
 def _is_cut(move: FormationMove, report: Report, parameters: FormationParameters) -> bool:

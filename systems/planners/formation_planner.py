@@ -148,8 +148,10 @@ class FormationPlanner(LeafSystem):
     def _look(self, context: Context, state: State) -> EventStatus:
         memory: Memory = context.get_abstract_state(self._memory).get_value()
         positions = self._positions_input.Eval(context).reshape(-1, 2).copy()
-        said = np.nan_to_num(self._failed_input.Eval(context))
-        failed = np.clip(np.rint(said), 0, 2).astype(np.int64)
+        failed = np.zeros(len(positions), np.int64)
+        said = self._failed_input.Eval(context)
+        if said.any():
+            failed += np.clip(np.rint(np.nan_to_num(said)), 0, 2).astype(np.int64)
         obstacles: Obstacles = self._obstacles_input.Eval(context)
         destination = self._destination_input.Eval(context).copy()
         number, outcome = self._progress_input.Eval(context)
@@ -160,7 +162,6 @@ class FormationPlanner(LeafSystem):
             obstacles = memory.obstacles
         if bad_destination:
             destination = memory.destination
-        unplaced = memory.unplaced
         discrete_state: Any = state.get_mutable_discrete_state()
         bad = {
             "bad_position": bad_position,
@@ -179,8 +180,10 @@ class FormationPlanner(LeafSystem):
             destination=destination,
             outcome=int(np.sign(outcome)) if known else 0,
         )
-        memory = after(memory, report, self._lattice, self._parameters, self._rule)
-        self._counts.add(context, discrete_state, **bad, unplaced=memory.unplaced - unplaced)
-        slot: Any = state.get_mutable_abstract_state(int(self._memory))
-        slot.set_value(memory)
+        following = after(memory, report, self._lattice, self._parameters, self._rule)
+        unplaced = following.unplaced - memory.unplaced
+        self._counts.add(context, discrete_state, **bad, unplaced=unplaced)
+        if following is not memory:
+            slot: Any = state.get_mutable_abstract_state(int(self._memory))
+            slot.set_value(following)
         return EventStatus.Succeeded()
