@@ -102,7 +102,8 @@ class Fix:
         """Standard deviation of the position along its worst axis, m."""
         if math.isnan(self.time):
             return math.inf
-        return math.sqrt(max(float(np.linalg.eigvalsh(self.P[:2, :2])[-1]), 0.0))
+        a, b, c = float(self.P[0, 0]), float(self.P[0, 1]), float(self.P[1, 1])
+        return math.sqrt(max((a + c) / 2 + math.hypot((a - c) / 2, b), 0.0))
 
 
 class Sighting(NamedTuple):

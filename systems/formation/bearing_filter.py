@@ -21,7 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.angles import wrap
-from systems.formation.bearings import in_robot, lateral_pixels, pixel_covariance, resect
+from systems.compiled import compiled, in_rows, packed
+from systems.formation.bearings import pixel_covariance, resect
 from systems.validation import require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -119,22 +120,43 @@ def predict(
     x: Array, P: Array, travel: Array, parameters: BearingFilterParameters
 ) -> tuple[Array, Array]:
     """Carries the state on by a short arc [distance (m), angle (rad)] (..., 2), as commanded."""
-    distance, angle = travel[..., 0], travel[..., 1]
-    middle = x[..., 2] + angle / 2
-    c, s = np.cos(middle), np.sin(middle)
-    along = parameters.distance_noise**2 * np.abs(distance)
-    # F P F' with F = 1 but for how the place follows the heading: row after row, then columns.
-    P = P.copy()
-    by_heading = np.stack([-distance * s, distance * c], axis=-1)
-    P[..., :2, :] += by_heading[..., None] * P[..., 2:3, :]
-    P[..., :, :2] += by_heading[..., None, :] * P[..., :, 2:3]
-    P[..., 0, 0] += along * c * c
-    P[..., 0, 1] += along * c * s
-    P[..., 1, 0] += along * c * s
-    P[..., 1, 1] += along * s * s
-    P[..., 2, 2] += parameters.turn_noise**2 * np.abs(angle)
-    P[..., 2, 2] += parameters.drift_noise**2 * np.abs(distance)
-    return np.concatenate([moved(x[..., :3], travel), x[..., 3:]], axis=-1), P
+    p, shape = parameters, x.shape
+    x, P = x.copy(), P.copy()
+    noise = np.array((p.distance_noise, p.turn_noise, p.drift_noise))
+    travel = np.broadcast_to(travel, (*shape[:-1], 2))
+    _predict(in_rows(x, SIZE), in_rows(P, SIZE, SIZE), in_rows(travel, 2), noise)
+    return x, P
+
+
+@compiled("void(f8[:,::1], f8[:,:,::1], f8[:,::1], f8[::1])")
+def _predict(x: Array, P: Array, travel: Array, noise: Array) -> None:
+    """Does `predict` for n robots in place; noise as in the parameters: by way, turn, drift."""
+    for n in range(len(x)):
+        distance, angle = travel[n, 0], travel[n, 1]
+        middle = x[n, 2] + angle / 2
+        c, s = math.cos(middle), math.sin(middle)
+        # F P F' with F = 1 but for how the place follows the heading: rows, then columns.
+        for k in range(SIZE):
+            P[n, 0, k] -= distance * s * P[n, 2, k]
+            P[n, 1, k] += distance * c * P[n, 2, k]
+        for k in range(SIZE):
+            P[n, k, 0] -= distance * s * P[n, k, 2]
+            P[n, k, 1] += distance * c * P[n, k, 2]
+        along = noise[0] * noise[0] * abs(distance)
+        P[n, 0, 0] += along * c * c
+        P[n, 0, 1] += along * c * s
+        P[n, 1, 0] += along * c * s
+        P[n, 1, 1] += along * s * s
+        P[n, 2, 2] += noise[1] * noise[1] * abs(angle) + noise[2] * noise[2] * abs(distance)
+        x[n, 0] += distance * c
+        x[n, 1] += distance * s
+        x[n, 2] = _wrapped(x[n, 2] + angle)
+
+
+@compiled()
+def _wrapped(angle: float) -> float:
+    """Returns the angle (rad) in (-pi, pi]."""
+    return math.pi - (math.pi - angle) % (2 * math.pi)
 
 
 def correct(
@@ -162,26 +184,74 @@ def correct(
         State and covariance; where it was used (...), and where it was refused (...): by the gate,
         or because that camera cannot see the point.
     """
-    ahead = in_robot(x[..., :3], point[..., None, :])[..., 0, 0]
-    seen = np.isfinite(u) & ((ahead < 0) == rear) & (np.abs(ahead) > _NEAREST)
-    with np.errstate(divide="ignore", invalid="ignore"):  # of what is beside, and not used
-        expected, by_pose = lateral_pixels(x[..., :3], point[..., None, :], focal_length)
-    expected = np.where(seen, expected[..., 0], 0.0)
-    by_pose = np.where(seen[..., None], by_pose[..., 0, :], 0.0)
-    H = np.zeros_like(x)
-    H[..., :3] = by_pose
-    H[..., 3 + rear] = 1.0
-    H[..., 5 + rear] = by_pose[..., 2]  # a camera turned is a robot turned
-    innovation = np.where(seen, u, 0.0) - expected - x[..., 3 + rear]
-    innovation = innovation - by_pose[..., 2] * x[..., 5 + rear]
-    PH = (P @ H[..., None])[..., 0]
-    variance = (H * PH).sum(axis=-1) + parameters.pixel_std**2
-    used = seen & (innovation**2 <= parameters.gate * variance)
-    gain = PH / variance[..., None] * used[..., None]
-    x = x + gain * innovation[..., None]
-    x[..., 2] = wrap(np.asarray(x[..., 2]))
-    P = P - gain[..., :, None] * PH[..., None, :]
-    return x, (P + np.swapaxes(P, -1, -2)) / 2, used, np.isfinite(u) & ~used
+    shape = x.shape[:-1]
+    x, P, u = x.copy(), P.copy(), np.asarray(u, float)
+    points = np.broadcast_to(point, (*shape, 2))
+    settings = np.array((focal_length, parameters.pixel_std, parameters.gate))
+    used = np.zeros(x.size // SIZE, bool)
+    _correct(
+        in_rows(x, SIZE), in_rows(P, SIZE, SIZE), packed(np.broadcast_to(u, shape).reshape(-1)),
+        in_rows(points, 2), settings, 3 + rear, used,
+    )  # fmt: skip
+    was_used = used.reshape(shape)
+    return x, P, was_used, np.isfinite(u) & ~was_used
+
+
+@compiled("void(f8[:,::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[::1], i8, b1[::1])")
+def _correct(
+    x: Array,
+    P: Array,
+    u: Array,
+    points: Array,
+    settings: Array,
+    camera: int,
+    used: NDArray[np.bool_],
+) -> None:
+    """Does `correct` for n robots in place.
+
+    Args:
+        x: (n, 7).
+        P: (n, 7, 7).
+        u: (n,) px.
+        points: (n, 2) m.
+        settings: focal length (px), noise (px), gate.
+        camera: where in the state its principal point is; its yaw is two further.
+        used: (n,) written where a sighting is used; False at first.
+    """
+    focal_length = settings[0]
+    H, PH = np.zeros(SIZE), np.empty(SIZE)
+    for n in range(len(x)):
+        x[n, 2] = _wrapped(x[n, 2])
+        dx, dy = points[n, 0] - x[n, 0], points[n, 1] - x[n, 1]
+        c, s = math.cos(x[n, 2]), math.sin(x[n, 2])
+        ahead, aside = c * dx + s * dy, c * dy - s * dx
+        seen = math.isfinite(u[n]) and (ahead < 0) == (camera == 4)
+        if not (seen and abs(ahead) > _NEAREST):
+            continue
+        by_ahead, by_aside = focal_length * aside / ahead**2, -focal_length / ahead
+        H[0] = s * by_aside - c * by_ahead
+        H[1] = -s * by_ahead - c * by_aside
+        H[2] = aside * by_ahead - ahead * by_aside
+        H[camera] = 1.0
+        H[camera + 2] = H[2]  # a camera turned is a robot turned
+        variance = settings[1] * settings[1]
+        innovation = u[n] + focal_length * aside / ahead
+        innovation -= x[n, camera] + H[2] * x[n, camera + 2]
+        for i in range(SIZE):
+            PH[i] = 0.0
+            for j in range(SIZE):
+                PH[i] += P[n, i, j] * H[j]
+            variance += H[i] * PH[i]
+        if not innovation * innovation <= settings[2] * variance:
+            continue
+        used[n] = True
+        for i in range(SIZE):
+            gain = PH[i] / variance
+            x[n, i] += gain * innovation
+            for j in range(i + 1):
+                mean = (P[n, i, j] + P[n, j, i]) / 2 - gain * PH[j]
+                P[n, i, j] = P[n, j, i] = mean
+        x[n, 2] = _wrapped(x[n, 2])
 
 
 def restart(
