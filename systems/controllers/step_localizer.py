@@ -19,7 +19,7 @@ from systems.cameras import PinholeCamera
 from systems.controllers.formation_step import FormationStepParameters, View
 from systems.controllers.step_task import Status, StepTask
 from systems.formation import bearing_filter
-from systems.formation.axes import SIDES, marker_centres
+from systems.formation.axes import SIDES
 from systems.formation.bearing_filter import SIZE, BearingFilterParameters
 from systems.formation.bearings import bearing
 from systems.formation.first_fix import marker_centre, place_in_robot, pose_by_places
@@ -114,14 +114,14 @@ class Sighting(NamedTuple):
         u: lateral pixel of its centre.
         point: (2,) where that is believed to be, m.
         face: direction that it faces, rad.
-        place: (2,) where it is in the axes of the robot that sees it, by its height, m.
+        rays: (4, 2) x/z, y/z of its corners.
     """
 
     robot: int
     u: float
     point: Array
     face: float
-    place: Array
+    rays: Array
 
 
 class StepLocalizer:
@@ -249,10 +249,10 @@ class StepLocalizer:
             pose = poses[robot]
             if not np.isfinite(pose).all():
                 continue
-            point = marker_centres(pose, self._step.marker_distance)[side]
             face = float(pose[2]) + side * math.pi / 2
-            place = place_in_robot(rays, self._step.marker_size, rear=rear)
-            found.append(Sighting(robot, marker_centre(rays) * focal_length, point, face, place))
+            outward = np.array([math.cos(face), math.sin(face)])
+            point = pose[:2] + self._step.marker_distance * outward
+            found.append(Sighting(robot, marker_centre(rays) * focal_length, point, face, rays))
         return found
 
     def _observe(
@@ -320,7 +320,9 @@ class StepLocalizer:
         start = task.start
         if not np.isfinite(start).all():
             start = next_vertex(task.poses[::-1, :2])  # outside the entry: off beacon 1
-        places, points = (np.array([s[k] for s in sightings]) for k in (4, 2))
+        size = self._step.marker_size
+        places = np.array([place_in_robot(s.rays, size, rear=rear) for s in sightings])
+        points = np.array([s.point for s in sightings])
         pose = pose_by_places(places, points, np.array([s.face for s in sightings]))
         elsewhere = pose is not None and np.hypot(*(pose[:2] - start)) > _ELSEWHERE * std
         if pose is not None and (fix.astray or elsewhere):

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from systems.angles import wrap
 from systems.cameras import PinholeCamera
+from systems.compiled import compiled, in_rows
 from systems.messages import Detections
 
 Array = NDArray[np.float64]
@@ -105,26 +106,42 @@ def measure(detections: Detections, camera: PinholeCamera, marker_size: float) -
     """
     if len(detections) == 0:
         return np.zeros((0, 2))
-    rays = camera.undistort(detections.corners.reshape(-1, 2)).reshape(-1, 4, 2)
-    a, b, c, d = (rays[:, i] for i in range(4))
-    with np.errstate(all="ignore"):
-        share = _cross(b - a, d - b) / _cross(c - a, d - b)
-        tangent = a[:, 0] + share * (c - a)[:, 0]
-        heights = np.stack([d - a, c - b])[..., 1]
-        heights[~(heights > 0)] = math.nan
-        nearness = heights.mean(axis=0) / marker_size
-        across = ((b + c) - (a + d))[:, 0] / 4 / nearness
-        # The half marker is across + tangent lean to the right and lean ahead.
-        secant = 1 + tangent**2
-        root = np.sqrt(np.maximum(secant * marker_size**2 / 4 - across**2, 0.0))
-        leans = (np.stack([root, -root]) - across * tangent) / secant
-        apart = np.abs(leans - marker_size * (1 / heights[1] - 1 / heights[0]) / 2)
-        lean = np.where(apart[0] < apart[1], *leans)
-        depth = (1 + np.hypot(1.0, 2 * nearness * lean)) / (2 * nearness)
-        bearing = -np.arctan(tangent)
-        values = np.column_stack([bearing, np.log(depth / np.cos(bearing))])
-    values[~np.isfinite(values).all(axis=1)] = math.nan
+    corners = in_rows(detections.corners, 4, 2)
+    values = np.empty((len(corners), 2))
+    _measure(camera.undistort(corners), marker_size, values)
     return values
+
+
+@compiled("void(f8[:,:,::1], f8, f8[:,::1])")
+def _measure(rays: Array, marker_size: float, values: Array) -> None:
+    """Does what `measure` says.
+
+    Args:
+        rays: (n, 4, 2) x/z, y/z of the corners.
+        marker_size: m.
+        values: (n, 2) written.
+    """
+    for n in range(len(rays)):
+        a, b, c, d = rays[n]
+        crossed = (c[0] - a[0]) * (d[1] - b[1]) - (c[1] - a[1]) * (d[0] - b[0])
+        share = ((b[0] - a[0]) * (d[1] - b[1]) - (b[1] - a[1]) * (d[0] - b[0])) / crossed
+        tangent = a[0] + share * (c[0] - a[0])
+        left, right = d[1] - a[1], c[1] - b[1]  # heights
+        nearness = (left + right) / 2 / marker_size
+        across = (b[0] + c[0] - a[0] - d[0]) / 4 / nearness
+        # The half marker is across + tangent lean to the right and lean ahead.
+        secant = 1 + tangent * tangent
+        root = math.sqrt(max(secant * marker_size**2 / 4 - across * across, 0.0))
+        one, other = (root - across * tangent) / secant, (-root - across * tangent) / secant
+        by_heights = marker_size * (1 / right - 1 / left) / 2
+        lean = one if abs(one - by_heights) < abs(other - by_heights) else other
+        depth = (1 + math.hypot(1.0, 2 * nearness * lean)) / (2 * nearness)
+        bearing = -math.atan(tangent)
+        distance = math.log(depth / math.cos(bearing))
+        upright = left > 0 and right > 0
+        sound = upright and math.isfinite(bearing) and math.isfinite(distance)
+        values[n, 0] = bearing if sound else math.nan
+        values[n, 1] = distance if sound else math.nan
 
 
 def mean_values(mean: Array, values: Array, frames: Array) -> Array:
@@ -255,7 +272,3 @@ def residuals(layout: Layout, x: Array, sightings: Sightings) -> Array:
 def jacobian(layout: Layout, x: Array, sightings: Sightings) -> Array:
     """Returns the derivatives of `predict` by the state: (n, 2, size)."""
     return SightingModel(layout, sightings).jacobian(x)
-
-
-def _cross(a: Array, b: Array) -> Array:
-    return np.asarray(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])

@@ -22,17 +22,17 @@ _MISFIT = 0.25  # m: a marker farther off is not where, or not what, it is belie
 
 
 def marker_centre(rays: Array) -> float:
-    """Returns x/z of a marker's centre: where the picture's diagonals cross.
+    """Returns x/z of a marker's centre: where the picture's diagonals cross; NaN if they do not.
 
     Args:
         rays: (4, 2) x/z, y/z of its corners.
     """
-    a, b, c, d = rays
-    along, across = c - a, d - b
-    offset = b - a
-    share = (offset[0] * across[1] - offset[1] * across[0]) / (
-        along[0] * across[1] - along[1] * across[0]
-    )
+    a, b, c, d = rays.tolist()
+    along, across = (c[0] - a[0], c[1] - a[1]), (d[0] - b[0], d[1] - b[1])
+    crossed = along[0] * across[1] - along[1] * across[0]
+    if crossed == 0:
+        return math.nan
+    share = ((b[0] - a[0]) * across[1] - (b[1] - a[1]) * across[0]) / crossed
     return float(a[0] + share * along[0])
 
 

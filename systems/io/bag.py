@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import textwrap
+import time
 from collections.abc import Collection, Iterator
 from pathlib import Path
 from types import TracebackType
@@ -39,15 +40,17 @@ _LATCHED = """\
     nsec: 854775807
   avoid_ros_namespace_conventions: false"""
 _METADATA_VERSION = 5
+_METADATA_PERIOD = 1.0  # s
 
 
 class BagWriter:
     """Writes a rosbag2 folder: `{folder name}_0.mcap` and `metadata.yaml`.
 
     Every second of log time ends a chunk, which goes to the operating system at once with the
-    file's index and `metadata.yaml` (which is replaced in one step). So a process that is killed
-    leaves a whole recording up to the start of that second, for our reader and for others. The
-    disk is not waited for (no fsync). The same messages give the same bytes.
+    file's index. So a process that is killed leaves a whole recording up to the start of that
+    second, for our reader and for others. `metadata.yaml` beside it is replaced, in one step, when
+    a topic is new, and else at most once a second, of the clock on the wall: a simulation would do
+    it forty times. The disk is not waited for (no fsync). The same messages give the same bytes.
 
     Args:
         folder: is made; must not hold a recording.
@@ -73,6 +76,8 @@ class BagWriter:
         self._schemas: dict[str, int] = {}
         self._closed = False
         self._metadata = ""
+        self._described = 0  # topics in `metadata.yaml`
+        self._due = 0.0  # when that is written again, s
         self.path = self.folder / f"{self.folder.resolve().name}_0.mcap"
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -119,8 +124,8 @@ class BagWriter:
                 what was on disk stays readable. This message goes into the next chunk.
         """
         require(not self._closed, "recording", str(self.folder), "open")
-        time = nanoseconds(log_time)
-        require(time >= 0, "log_time", log_time, "0 or later")
+        moment = nanoseconds(log_time)
+        require(moment >= 0, "log_time", log_time, "0 or later")
         channel, known, _ = self._topics.get(topic) or self._add(topic, msgtype, latched)
         require(msgtype == known, f"type of {topic}", msgtype, f"{known} as before")
         try:
@@ -128,13 +133,13 @@ class BagWriter:
         except Exception as error:  # whatever a wrong field trips in the compiled serialiser
             raise ValueError(f"message on {topic} is no {msgtype}: {first_line(error)}") from error
         failure: OSError | None = None
-        if (chunk := time // self._chunk_length) != self._chunk:
+        if (chunk := moment // self._chunk_length) != self._chunk:
             self._chunk = chunk
             try:
                 self.flush()
             except OSError as error:
                 failure = error
-        self._mcap.add_message(channel, time, data)
+        self._mcap.add_message(channel, moment, data)
         if failure is not None:
             raise failure
 
@@ -154,7 +159,11 @@ class BagWriter:
         except OSError as error:
             self.lost += pending
             raise OSError(error.errno, error.strerror, str(self.path)) from error
-        self._write_metadata()
+        described = len(self._topics)
+        now = time.monotonic()
+        if self._closed or described != self._described or now >= self._due:
+            self._write_metadata()
+            self._described, self._due = described, now + _METADATA_PERIOD
 
     def close(self) -> None:
         """Writes the last chunk and closes the file; again: does nothing.
