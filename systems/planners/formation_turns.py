@@ -261,14 +261,14 @@ class FormationTurns(LeafSystem):
 
     # --- Outputs ---
 
-    def _now(self, context: Context) -> tuple[Phase, int]:
+    def _now(self, context: Context) -> tuple[float, int]:
         """Returns the phase and the robot of the present move, -1 for none."""
-        phase, _, _, mover, _ = context.get_discrete_state(self._turn).get_value()
-        return Phase(int(phase)), int(mover)
+        phase, _, _, mover, _ = context.get_discrete_state(self._turn).get_value().tolist()
+        return phase, int(mover)
 
     def _task_of(self, context: Context, robot: int) -> StepTask:
         phase, mover = self._now(context)
-        if phase == Phase.DRIVE and robot == mover:
+        if robot == mover and phase == Phase.DRIVE:
             task: StepTask = context.get_abstract_state(int(self._task)).get_value()
             return task
         return OFF
@@ -276,7 +276,7 @@ class FormationTurns(LeafSystem):
     def _moving(self, context: Context) -> Array:
         phase, mover = self._now(context)
         moving = np.zeros(self._robots)
-        if phase in (Phase.START, Phase.DRIVE, Phase.STOP):
+        if phase in _AWAY:
             moving[mover] = 1.0
         return moving
 
@@ -298,7 +298,8 @@ class FormationTurns(LeafSystem):
     def _update(self, context: Context, state: State) -> EventStatus:
         p, t = self._parameters, context.get_time()
         discrete_state: Any = state.get_mutable_discrete_state()
-        phase, since, number, mover, outcome = context.get_discrete_state(self._turn).get_value()
+        turn = context.get_discrete_state(self._turn).get_value()
+        phase, since, number, mover, outcome = turn.tolist()
         waited = t - since + 1e-9
         counts: Counter[str] = Counter()
         poses = self._believed(context, discrete_state, counts)
@@ -377,7 +378,7 @@ class FormationTurns(LeafSystem):
     ) -> float:
         """Returns 1 when the present task is done, -1 when it is given up, else 0."""
         task: StepTask = context.get_abstract_state(int(self._task)).get_value()
-        number, status, tries = self._status_inputs[mover].Eval(context)
+        number, status, tries = self._status_inputs[mover].Eval(context).tolist()
         if number == task.number:
             was_waiting, waits, _ = context.get_discrete_state(self._effort).get_value()
             waiting = status == Status.WAITING
@@ -414,4 +415,5 @@ class FormationTurns(LeafSystem):
             discrete_state.set_value(self._belief, moved.ravel())
 
 
+_AWAY = (Phase.START, Phase.DRIVE, Phase.STOP)
 _NO_BEACON = 2.0  # as `failed` says it

@@ -106,8 +106,10 @@ class SampledSensor(LeafSystem):
         return self._active_input
 
     def _is_off(self, context: Context) -> bool:
-        port = self._active_input
-        return port is not None and port.HasValue(context) and not port.Eval(context)[0] > 0
+        if self._active_input is None:
+            return False
+        active = self.EvalVectorInput(context, self._active_input.get_index())
+        return active is not None and not active[0] > 0
 
     def _take(self, context: Context, state: State) -> EventStatus:
         if self._is_off(context):

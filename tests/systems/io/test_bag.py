@@ -215,6 +215,36 @@ def test_the_index_points_at_every_message(tmp_path):
     assert found == summary.statistics.message_count
 
 
+def test_the_metadata_follows_new_topics_at_once_and_messages_in_seconds(tmp_path, monkeypatch):
+    clock = [100.0]
+    monkeypatch.setattr("systems.io.bag.time.monotonic", lambda: clock[0])
+
+    def said() -> dict[str, int]:
+        text = (tmp_path / "bag" / "metadata.yaml").read_text()
+        info = YAML(typ="safe").load(text)["rosbag2_bagfile_information"]
+        topics = info["topics_with_message_count"]
+        return {t["topic_metadata"]["name"]: t["message_count"] for t in topics}
+
+    with BagWriter(tmp_path / "bag") as writer:
+
+        def write(topic: str, t: float) -> None:
+            message = ros_motion.imu_to_ros(np.zeros(6), stamp=t, frame_id="imu")
+            writer.write(topic, IMU, message, t)
+
+        for k in range(4):  # a chunk each
+            write("/imu", float(k))
+        assert said() == {"/imu": 0}  # since its first message: no chunk was at its end
+        write("/other", 3.5)
+        write("/imu", 4.0)
+        assert said() == {"/imu": 4, "/other": 1}
+        write("/imu", 5.0)
+        assert said() == {"/imu": 4, "/other": 1}
+        clock[0] += 1.0
+        write("/imu", 6.0)
+        assert said() == {"/imu": 6, "/other": 1}
+    assert said() == {"/imu": 7, "/other": 1}
+
+
 def test_the_metadata_says_what_ros_2_wants(tmp_path):
     written, _ = write_run(tmp_path / "bag")
     document = YAML(typ="safe").load((tmp_path / "bag" / "metadata.yaml").read_text())
