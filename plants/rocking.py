@@ -24,6 +24,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
+from systems.compiled import compiled
 from systems.noise import NoiseStream
 from systems.validation import require, require_non_negative, require_positive
 
@@ -84,7 +85,8 @@ def tilt(waves: Waves, t: float) -> tuple[Array, Array, Array]:
 
     It fades in during the first half second, from rest at zero.
     """
-    q, q_dot, q_ddot = (waves.weights * np.exp(1j * t * waves.rates)).sum(axis=-1).imag
+    q, q_dot, q_ddot = np.empty((3, 2))
+    _sines(waves.rates, waves.weights, t, q, q_dot, q_ddot)
     s = t / _FADE
     if s >= 1:
         return q, q_dot, q_ddot
@@ -93,6 +95,25 @@ def tilt(waves: Waves, t: float) -> tuple[Array, Array, Array]:
     f_dot = 30 * (s * (1 - s)) ** 2 / _FADE
     f_ddot = 60 * s * (1 - s) * (1 - 2 * s) / _FADE**2
     return f * q, f_dot * q + f * q_dot, f_ddot * q + 2 * f_dot * q_dot + f * q_ddot
+
+
+@compiled("void(f8[:,::1], c16[:,:,::1], f8, f8[::1], f8[::1], f8[::1])")
+def _sines(
+    rates: Array,
+    weights: NDArray[np.complex128],
+    t: float,
+    q: Array,
+    q_dot: Array,
+    q_ddot: Array,
+) -> None:
+    """Writes the sums of the waves and of their derivatives at t (s), before they fade in."""
+    for axis in range(2):
+        q[axis] = q_dot[axis] = q_ddot[axis] = 0.0
+        for k in range(rates.shape[1]):
+            c, s = math.cos(t * rates[axis, k]), math.sin(t * rates[axis, k])
+            q[axis] += weights[0, axis, k].real * s + weights[0, axis, k].imag * c
+            q_dot[axis] += weights[1, axis, k].real * s + weights[1, axis, k].imag * c
+            q_ddot[axis] += weights[2, axis, k].real * s + weights[2, axis, k].imag * c
 
 
 def _coefficients(s: float) -> tuple[float, float, float, float, float]:

@@ -18,7 +18,7 @@ from pydrake.systems.sensors import CameraInfo
 from ruamel.yaml import YAML, YAMLError
 
 from systems.compiled import in_rows
-from systems.plumb_bob import distort_all, find_rays
+from systems.plumb_bob import distort_all, find_rays, project_all
 from systems.validation import require
 
 Array = NDArray[np.float64]
@@ -130,16 +130,10 @@ class PinholeCamera:
         Returns:
             (..., 2) px, and (..., 2, 3) px/m.
         """
-        inverse_depth = 1 / p_C[..., 2:]
-        normalised = p_C[..., :2] * inverse_depth
-        focal = self.K[[0, 1], [0, 1]]
-        jacobian = np.zeros((*p_C.shape[:-1], 2, 3))
-        jacobian[..., 0, 0] = jacobian[..., 1, 1] = inverse_depth[..., 0]
-        jacobian[..., :, 2] = -normalised * inverse_depth
-        if self.distorted:
-            normalised, by_normalised = self._distort(normalised)
-            jacobian = by_normalised @ jacobian
-        return normalised * focal + self.K[:2, 2], jacobian * focal[:, None]
+        points = in_rows(p_C, 3)
+        pixels, jacobian = np.empty((len(points), 2)), np.empty((len(points), 2, 3))
+        project_all(points, *self.matrices, pixels, jacobian)
+        return pixels.reshape(*p_C.shape[:-1], 2), jacobian.reshape(*p_C.shape[:-1], 2, 3)
 
     def undistort(self, pixels: Array) -> Array:
         """Returns the rays (..., 2) x/z, y/z of pixels (see `rays`)."""

@@ -80,3 +80,26 @@ def find_rays(
             rays[k, 0], rays[k, 1] = math.nan, math.nan
         by_ray[k, 0, 0], by_ray[k, 0, 1] = fx * by_x, fx * across
         by_ray[k, 1, 0], by_ray[k, 1, 1] = fy * across, fy * by_y
+
+
+@compiled("void(f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,:,::1])")
+def project_all(points: Array, K: Array, D: Array, pixels: Array, jacobian: Array) -> None:
+    """Writes the pixels (n, 2) of points (n, 3) and their derivative (n, 2, 3) by the points.
+
+    Args:
+        points: in the optical frame, z > 0, m.
+        K: (3, 3) camera matrix, px.
+        D: (5,) coefficients.
+        pixels: written, px.
+        jacobian: written, px/m.
+    """
+    fx, fy = K[0, 0], K[1, 1]
+    for k in range(len(points)):
+        inverse = 1 / points[k, 2]
+        x, y = points[k, 0] * inverse, points[k, 1] * inverse
+        bent_x, bent_y, by_x, by_y, across = distort(x, y, D)
+        pixels[k, 0], pixels[k, 1] = fx * bent_x + K[0, 2], fy * bent_y + K[1, 2]
+        jacobian[k, 0, 0], jacobian[k, 0, 1] = fx * by_x * inverse, fx * across * inverse
+        jacobian[k, 1, 0], jacobian[k, 1, 1] = fy * across * inverse, fy * by_y * inverse
+        jacobian[k, 0, 2] = -fx * (by_x * x + across * y) * inverse
+        jacobian[k, 1, 2] = -fy * (across * x + by_y * y) * inverse

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.compiled import compiled, packed
 from systems.estimators.shell_model import Turn
 
 Array = NDArray[np.float64]
@@ -24,7 +25,6 @@ Array = NDArray[np.float64]
 _INDEX, _SUMS, _RATES = 0, slice(1, 8), slice(8, 14)
 WIDTH = 14
 _RATE_WINDOW = 0.01  # s, over which a momentary rate is averaged
-_WINDOW = np.array([0.0, -_RATE_WINDOW / 2, _RATE_WINDOW / 2])
 
 
 def rows_for(duration: float, rate: float) -> int:
@@ -82,9 +82,10 @@ class RateTrail:
             newest: number of the last sample.
         """
         oldest = self._oldest(newest)
-        sums = self._sums(np.array([start, end])[:, None] + _WINDOW, oldest, newest)
-        turn = (sums[1, 0] - sums[0, 0]).tolist()
-        rates = (sums[:, 2, :3] - sums[:, 1, :3]) / _RATE_WINDOW
+        sums = np.empty((6, 7))
+        _sums(packed(self._rows), start, end, self._age, self._rate, oldest, newest, sums)
+        turn = (sums[3] - sums[0]).tolist()
+        rates = (sums[2::3, :3] - sums[1::3, :3]) / _RATE_WINDOW
         begin = oldest / self._rate - self._age
         known = abs(max(end, begin) - max(start, begin))
         lost = max(abs(end - start) - known, 0.0)
@@ -99,14 +100,35 @@ class RateTrail:
         full = self._rows[k % n, _INDEX] == k
         return k if full else int(np.fmin.reduce(self._rows[:, _INDEX]))
 
-    def _sums(self, moments: Array, oldest: int, newest: int) -> Array:
-        """Returns the integrals (..., 7) up to moments (...) s; before the memory its first."""
-        rows, n = self._rows, len(self._rows)
-        place = (moments + self._age) * self._rate
-        within = np.minimum(np.maximum(place, oldest), newest)
-        k = within.astype(np.intp)
-        before, after = rows[k % n, _SUMS], rows[np.minimum(k + 1, newest) % n, _SUMS]
-        sums: Array = before + (within - k)[..., None] * (after - before)
-        beyond = np.maximum(place - newest, 0.0) / self._rate
-        sums[..., :6] += beyond[..., None] * rows[newest % n, _RATES]
-        return sums
+
+@compiled("void(f8[:,::1], f8, f8, f8, f8, i8, i8, f8[:,::1])")
+def _sums(
+    rows: Array,
+    start: float,
+    end: float,
+    age: float,
+    rate: float,
+    oldest: int,
+    newest: int,
+    sums: Array,
+) -> None:
+    """Writes the integrals (7,) up to six moments; before the memory its first.
+
+    The moments are the start and half a window before and after it, then the same about the end.
+    """
+    n = len(rows)
+    for m in range(6):
+        moment = start if m < 3 else end
+        if m % 3:
+            moment += _RATE_WINDOW / 2 if m % 3 == 2 else -_RATE_WINDOW / 2
+        place = (moment + age) * rate
+        within = min(max(place, float(oldest)), float(newest))
+        k = int(within)
+        before, after = k % n, min(k + 1, newest) % n
+        part = within - k
+        beyond = max(place - newest, 0.0) / rate
+        for i in range(7):
+            a, b = rows[before, 1 + i], rows[after, 1 + i]
+            sums[m, i] = a + part * (b - a)
+            if i < 6:
+                sums[m, i] += beyond * rows[newest % n, 8 + i]

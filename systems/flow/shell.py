@@ -7,6 +7,7 @@ is in S, and the points of the shell turn about S's origin.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from systems.cameras import PinholeCamera
+from systems.compiled import compiled, in_rows, packed
 from systems.markers.pnp import rotation_from_vector
 from systems.validation import require, require_positive
 
@@ -66,19 +68,28 @@ def back_project(
     Returns:
         (n, 3) m, in S; NaN where a pixel shows none.
     """
-    normalised = camera.undistort(pixels)
-    direction = np.ones((len(normalised), 3))
-    direction[:, :2] = normalised
-    direction @= X_SC.rotation().matrix().T
-    direction /= np.sqrt((direction * direction).sum(axis=1, keepdims=True))
-    origin = X_SC.translation()
-    along = direction @ origin
-    discriminant = along * along - (origin @ origin - radius * radius)
-    with np.errstate(invalid="ignore"):
-        distance = -along - np.sqrt(discriminant)
-    distance[~(distance > 0)] = np.nan
-    points: Array = origin + distance[:, None] * direction
+    points = np.empty((len(pixels), 3))
+    R, p = packed(X_SC.rotation().matrix()), packed(X_SC.translation())
+    _meet_sphere(in_rows(camera.undistort(pixels), 2), R, p, radius, points)
     return points
+
+
+@compiled("void(f8[:,::1], f8[:,::1], f8[::1], f8, f8[:,::1])")
+def _meet_sphere(rays: Array, R: Array, p: Array, radius: float, points: Array) -> None:
+    """Writes where rays (n, 2) x/z, y/z of a camera at R, p meet a sphere about the origin."""
+    square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] - radius * radius
+    d = np.empty(3)
+    for k in range(len(rays)):
+        x, y = rays[k, 0], rays[k, 1]
+        length = math.sqrt(x * x + y * y + 1)
+        along = 0.0
+        for i in range(3):
+            d[i] = (R[i, 0] * x + R[i, 1] * y + R[i, 2]) / length
+            along += d[i] * p[i]
+        discriminant = along * along - square
+        distance = -along - math.sqrt(discriminant) if discriminant >= 0 else math.nan
+        for i in range(3):
+            points[k, i] = p[i] + distance * d[i] if distance > 0 else math.nan
 
 
 def project(camera: PinholeCamera, X_SC: RigidTransform, points: Array) -> Array:
