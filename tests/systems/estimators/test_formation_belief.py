@@ -199,3 +199,20 @@ def test_vertices_make_equilateral_triangles() -> None:
         sides = [np.hypot(*(p - q)) for p, q in ((a, b), (b, c), (c, a))]
         np.testing.assert_allclose(sides, 1.5, rtol=1e-12)
     assert len(FRONT_AND_REAR) == 2
+
+
+def test_more_robots_know_better_where_the_last_one_is() -> None:
+    """Ten moves: the information bound falls with their number, and the estimate follows it."""
+    errors, bounds = {}, {}
+    for robots in (4, 6, 12):
+        trips = []
+        for seed in range(6):
+            world = FormationWorld(robots=robots, seed=seed, lasting=(0.00035, 0.003))
+            trips.append(travel(world, world.estimator(), 10))
+        least = world.batch_covariance(use_range=True)[-3:-1, -3:-1]  # of the last vertex
+        bounds[robots] = math.sqrt(np.trace(least))
+        errors[robots] = math.sqrt(np.mean([(trip.error[-1] ** 2).sum() for trip in trips]))
+        assert 0.5 < np.mean([trip.nees for trip in trips]) < 1.5
+        assert errors[robots] < 1.5 * bounds[robots]
+    assert bounds[12] < bounds[6] < bounds[4]
+    assert max(errors[6], errors[12]) < errors[4]
