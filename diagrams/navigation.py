@@ -34,7 +34,7 @@ from diagrams.viewer import EstimateViewer
 from diagrams.world import WorldParameters
 from plants.arena import check_free
 from systems.angles import spatial_pose
-from systems.controllers.collision_monitor import CollisionMonitorParameters
+from systems.controllers.braking import CollisionMonitorParameters
 from systems.controllers.search import SearchParameters, SearchWhenLost
 from systems.estimators.planar_kalman import UNKNOWN
 from systems.io.ros_motion import FrameTransform, transforms_to_ros

@@ -11,8 +11,8 @@ from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.cameras import PinholeCamera
-from systems.compiled import compiled
 from systems.health import Counts
+from systems.markers.carried_pose import pose_of_body
 from systems.markers.corner_noise import corner_deviation
 from systems.markers.layout import MarkerMap
 from systems.markers.planar_pose import SAME_POSE, angle_between, closed_form, planar_poses
@@ -24,7 +24,6 @@ from systems.markers.pnp import (
 )
 from systems.memo import Memo
 from systems.messages import Detections, PoseEstimate
-from systems.small_matrices import congruence, multiply
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -295,7 +294,7 @@ class MapLocalizer:
     ) -> PoseEstimate:
         cov_C = covariance(solutions.information[k : k + 1], 1.0)[0]
         R_WB, p_WB, cov = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
-        _pose_of_body(solutions.R[k], solutions.p[k], cov_C, *self._X_CB, R_WB, p_WB, cov)
+        pose_of_body(solutions.R[k], solutions.p[k], cov_C, *self._X_CB, R_WB, p_WB, cov)
         return PoseEstimate(
             stamp=stamp,
             frame_id=self.marker_map.frame,
@@ -343,38 +342,6 @@ def _areas(corners: Array) -> Array:
     # Half the cross product of the diagonals.
     p, q = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
     return np.asarray(np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]) / 2)
-
-
-@compiled("void(f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,::1])")
-def _pose_of_body(
-    R_CW: Array,
-    p_CW: Array,
-    covariance: Array,
-    R_CB: Array,
-    p_CB: Array,
-    R_WB: Array,
-    p_WB: Array,
-    carried: Array,
-) -> None:
-    """Writes X_WB and its covariance, given X_CW and that of (delta, tau) of X_CW in C."""
-    # A Newton step toward the rotation next to a product of many, which rounding has bent.
-    square, R_WC = np.empty((3, 3)), np.empty((3, 3))
-    multiply(R_CW.T, R_CW, square)
-    multiply(R_CW, square, R_WB)
-    for i in range(3):
-        for j in range(3):
-            R_WC[j, i] = 1.5 * R_CW[i, j] - 0.5 * R_WB[i, j]
-    multiply(R_WC, R_CB, R_WB)
-    x, y, z = p_CB[0] - p_CW[0], p_CB[1] - p_CW[1], p_CB[2] - p_CW[2]
-    # The body turns by -R_WC delta, about C; and moves by -R_WC (tau - (p_CB - p_CW) x delta).
-    G = np.zeros((6, 6))
-    for i in range(3):
-        a, b, c = R_WC[i, 0], R_WC[i, 1], R_WC[i, 2]
-        p_WB[i] = a * x + b * y + c * z
-        G[i, 0], G[i, 1], G[i, 2] = -a, -b, -c
-        G[3 + i, 3], G[3 + i, 4], G[3 + i, 5] = -a, -b, -c
-        G[3 + i, 0], G[3 + i, 1], G[3 + i, 2] = b * z - c * y, c * x - a * z, a * y - b * x
-    congruence(G, covariance, carried)
 
 
 class Localizer(LeafSystem):

@@ -15,7 +15,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.controllers.collision_monitor import CollisionMonitorParameters, safe_command
+from systems.controllers.braking import CollisionMonitorParameters
+from systems.controllers.collision_monitor import safe_command
 from systems.messages import OccupancyGrid, Scan
 from systems.planners.astar import AStarParameters, plan, shortest_way
 from systems.planners.cost_map import CostMap, cost_map

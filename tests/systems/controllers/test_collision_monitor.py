@@ -9,15 +9,17 @@ import pytest
 from pydrake.common.value import AbstractValue
 from pydrake.systems.analysis import Simulator
 
-from systems.controllers.collision_monitor import (
-    CollisionMonitor,
+from systems.controllers.braking import (
     CollisionMonitorParameters,
     are_safe,
     clearance,
+    stopping_paths,
+)
+from systems.controllers.collision_monitor import (
+    CollisionMonitor,
     move,
     safe_command,
     still_hidden,
-    stopping_paths,
 )
 from systems.messages import Scan
 
