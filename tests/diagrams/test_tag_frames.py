@@ -107,7 +107,10 @@ def test_the_replay_shows_the_frames(tmp_path: Path) -> None:
     [
         ("circle.radius=0", "circle.radius is 0.0: must be greater than 0"),
         ("circle.speed=-1", "circle.speed is -1.0: must be greater than 0"),
-        ("camera=encoders", "camera is 'encoders': must be one of the sensors that fit: front_c"),
+        (
+            "camera=encoders",
+            "camera is 'encoders': must be one of the robot's sensors that fit: front_c",
+        ),
         ("world.markers.tags=[]", "world.markers is 'empty': must be of tags"),
     ],
 )
