@@ -89,7 +89,7 @@ def simulate(
     require_non_negative(realtime=realtime)
     if out is not None:
         _make_folder(out)
-    ready = scenario.prepared(meshcat=meshcat, out=out)
+    ready = scenario.prepared(meshcat=meshcat, out=out, progress=progress)
     if meshcat is not None:
         meshcat.StartRecording(frames_per_second=FRAME_RATE)
     mission: Mission = ready.build(meshcat=meshcat, out=out)

@@ -9,7 +9,7 @@ seed is drawn when all layers are there (see `diagrams.random_world`).
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
@@ -103,14 +103,21 @@ class Scenario:
         """When the run ends at the latest, s."""
         return self.duration
 
-    def prepared(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Self:
+    def prepared(
+        self,
+        *,
+        meshcat: Meshcat | None = None,
+        out: Path | None = None,
+        progress: Callable[[float, float], None] | None = None,
+    ) -> Self:
         """Does what has to be done before the run; returns the scenario that is then built.
 
         Args:
             meshcat: where it is shown, if anywhere.
             out: folder of the run; None writes nothing.
+            progress: called with what is done and the whole, s.
         """
-        del meshcat, out
+        del meshcat, out, progress
         return self
 
     @property

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import logging
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
@@ -94,12 +95,16 @@ class TeachReplayScenario(TeachScenario, ReplayKeys):
         )
 
     def prepared(
-        self, *, meshcat: Meshcat | None = None, out: Path | None = None
+        self,
+        *,
+        meshcat: Meshcat | None = None,
+        out: Path | None = None,
+        progress: Callable[[float, float], None] | None = None,
     ) -> TeachReplayScenario:
         """Teaches and optimises; returns the scenario that replays what came of it."""
         ready = copy.copy(self)
         with tempfile.TemporaryDirectory() as folder:
-            ready._taught = _teach(self, out or Path(folder), meshcat)
+            ready._taught = _teach(self, out or Path(folder), meshcat, progress)
         if meshcat is not None:  # what teaching has left there
             meshcat.DeleteAddedControls()
             meshcat.DeleteRecording()
@@ -133,23 +138,31 @@ class TeachReplayScenario(TeachScenario, ReplayKeys):
         )
 
 
-def _teach(scenario: TeachReplayScenario, out: Path, meshcat: Meshcat | None) -> Taught:
+def _teach(
+    scenario: TeachReplayScenario,
+    out: Path,
+    meshcat: Meshcat | None,
+    progress: Callable[[float, float], None] | None,
+) -> Taught:
     from diagrams.run import simulate
 
     keys = {entry.name: getattr(scenario, entry.name) for entry in fields(TeachScenario)}
     teaching = TeachScenario(**keys | {"mission": "teach", "name": "teach"})
     teaching.record = copy.copy(teaching.record)
     teaching.record.bag = True
-    run = simulate(teaching, out=out / "teach", meshcat=meshcat)
+    run = simulate(teaching, out=out / "teach", meshcat=meshcat, progress=progress)
     mission = run.mission
     assert isinstance(mission, TeachMission)
     log, chains = mission.teach_log(run.context), mission.chains(run.context)
     metrics = run.report["metrics"]
     if not run.succeeded:
         return _failed(Taught(log, chains, metrics, run.report["outcome"]), "teaching", "")
-    mapping = map_recording(
-        out / "teach" / "bag", out=out / "map", known=out / "teach" / "anchor.json"
-    )
+    try:
+        mapping = map_recording(
+            out / "teach" / "bag", out=out / "map", known=out / "teach" / "anchor.json"
+        )
+    except ValueError as error:
+        return _failed(Taught(log, chains, metrics, "refused"), "map", str(error))
     found = mapping.report["metrics"]
     if not mapping.succeeded:
         reasons = "; ".join(mapping.report["reasons"].values())
