@@ -37,7 +37,10 @@ def compiled(signature: str = "") -> Callable[[Function], Function]:
     """
 
     def decorate(function: Function) -> Function:
-        made: Any = numba.njit(cache=True, error_model="numpy")(function)
+        try:
+            made: Any = numba.njit(cache=True, error_model="numpy")(function)
+        except RuntimeError:  # nowhere to keep it: no folder can be written
+            made = numba.njit(error_model="numpy")(function)
         if signature and hasattr(made, "compile"):  # Numba is not disabled
             _WAITING.append((made, signature))
         return cast(Function, made)

@@ -98,3 +98,18 @@ def test_products_are_those_of_numpy() -> None:
     np.testing.assert_allclose(product, A @ B, rtol=1e-13)
     congruence(A, root @ root.T, carried)
     np.testing.assert_allclose(carried, A @ root @ root.T @ A.T, rtol=1e-12)
+
+
+def test_where_nothing_can_be_kept_it_is_compiled_all_the_same(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def refuse(*_: object) -> None:
+        raise RuntimeError("cannot cache function: no locator available")
+
+    monkeypatch.setattr("numba.core.dispatcher.Dispatcher.enable_caching", refuse)
+
+    @compiled()
+    def double(value: float) -> float:
+        return 2 * value
+
+    assert double(1.5) == 3.0
