@@ -39,8 +39,8 @@ class LimoParameters:
     Sources: LIMO User Manual, section 1.3 (322 x 220 x 251 mm, wheelbase 200 mm, ground clearance
     24 mm, four hub motors of 14.4 W, 1 m/s at most). Mass, track and wheels are as commonly given
     for later versions (4.2 kg, 172 mm, wheels of 45 mm radius; the manual's first version has
-    4.8 kg and 175 mm): measure your own. What drives and slips is ours: friction of rubber on a floor, and motors
-    that hold their speed, since a hub motor with an encoder is regulated.
+    4.8 kg and 175 mm): measure your own. What drives and slips is ours: friction of rubber on a
+    floor, and motors that hold their speed, since a hub motor with an encoder is regulated.
 
     Attributes:
         wheel_radius: m.
