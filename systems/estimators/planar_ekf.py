@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -27,10 +26,7 @@ from systems.estimators.planar_model import (
     Correction,
     Drive,
     Measurement,
-    correct,
     is_covariance,
-    is_known,
-    predict,
     unknown,
 )
 from systems.estimators.relocation import Agreement, refused
@@ -136,13 +132,8 @@ class PlanarEkf(LeafSystem):
         require_positive(rate=rate)
         self._parameters = p = parameters or PlanarEkfParameters()
         self._rate = rate
-        self._noise = p.process_noise()
-        self._correct = partial(
-            correct,
-            stamp_variance=p.stamp_noise**2,
-            gate=p.squared_gate(),
-            take_ambiguous=p.ambiguous == "nearest",
-        )
+        self._noise = np.array(p.process_noise())
+        self._rules = np.array([p.stamp_noise**2, p.squared_gate(), p.ambiguous == "nearest"])
         self._floor = np.diag(np.square(p.measurement_floor))
         self._unknown = unknown(p.gyro_bias_std, p.scale_std, p.gyro_scale_std)
         self._gyro_ticks = 1 + round(p.gyro_delay * rate)
@@ -227,26 +218,19 @@ class PlanarEkf(LeafSystem):
         # The state is the pose now. What the inputs say carries it to the next tick.
         k = sample_index(context.get_time(), self._rate)
         counts: Counter[str] = Counter()
-        memory = Memory(
-            discrete_state.get_mutable_value(self._memory).reshape(-1, WIDTH), self._rate
-        )
-        memory.begin(
-            k,
-            context.get_discrete_state(self._x).get_value(),
-            context.get_discrete_state(self._P).get_value().reshape(SIZE, SIZE),
-            self._drive(context, discrete_state, counts),
-        )
+        rows = discrete_state.get_mutable_value(self._memory).reshape(-1, WIDTH)
+        memory = Memory(rows, self._rate)
+        x = discrete_state.get_mutable_value(self._x)
+        P = discrete_state.get_mutable_value(self._P).reshape(SIZE, SIZE)
+        memory.begin(k, x, P, self._drive(context, discrete_state, counts))
         first = self._measure_yaw_rate(context, memory, k, counts)
         measurement, several = self._arrival(context, discrete_state, memory, k, counts)
         if measurement is None:
-            x, P, _ = memory.replay(first, k, self._predict, self._correct)
+            found = memory.replay(first, k, self._noise, self._rules)
         else:
             memory.put(k, measurement)
             first = min(first, memory.tick_of(measurement.stamp), k)
-            x, P, found = memory.replay(
-                first, k, self._predict, self._correct, look_at=measurement.stamp
-            )
-            assert found is not None
+            found = memory.replay(first, k, self._noise, self._rules, look_at=measurement.stamp)
             counts["accepted" if found.verdict == "started" else found.verdict] += 1
             if not math.isnan(found.nis):
                 number = context.get_discrete_state(self._nis)[1]
@@ -255,13 +239,10 @@ class PlanarEkf(LeafSystem):
                 counts["restarted"] += 1
                 memory.forget(*self._unknown)
                 memory.put(k, measurement)
-                x, P, _ = memory.replay(first, k, self._predict, self._correct)
-        discrete_state.set_value(self._x, x)
-        discrete_state.set_value(self._P, P.ravel())
-        self._counts.add(context, discrete_state, **counts)
-
-    def _predict(self, x: Array, P: Array, drive: Drive, dt: float) -> tuple[Array, Array]:
-        return predict(x, P, drive, dt, self._noise) if is_known(P) else (x, P)
+                found = memory.replay(first, k, self._noise, self._rules)
+        x[:], P[:] = found.x, found.P
+        if counts:
+            self._counts.add(context, discrete_state, **counts)
 
     def _drive(
         self, context: Context, discrete_state: DiscreteValues, counts: Counter[str]
@@ -274,10 +255,10 @@ class PlanarEkf(LeafSystem):
         if not all(map(math.isfinite, command)):
             counts["bad_command"] += 1
             command, variance = [0.0, 0.0], p.lost_speed_noise**2
-        motors = context.get_discrete_state(self._motors).get_value().tolist()
-        v, speed = lagged(motors[0], command[0], p.speed_lag, dt)
-        omega, turn_rate = lagged(motors[1], command[1], p.speed_lag, dt)
-        discrete_state.set_value(self._motors, [v, omega])
+        motors = discrete_state.get_mutable_value(self._motors)
+        v, omega = motors.tolist()
+        motors[0], speed = lagged(v, command[0], p.speed_lag, dt)
+        motors[1], turn_rate = lagged(omega, command[1], p.speed_lag, dt)
         if self._wheel_speeds_input.HasValue(context):
             measured = p.wheel_radius * float(np.mean(self._wheel_speeds_input.Eval(context)))
             if math.isfinite(measured):
@@ -294,12 +275,7 @@ class PlanarEkf(LeafSystem):
         if not abs(yaw_rate) <= p.gyro_range:
             counts["bad_imu"] += 1
             yaw_rate, variance = math.nan, p.lost_turn_noise**2
-        tick = k - self._gyro_ticks
-        if memory.measure_yaw_rate(tick, yaw_rate, variance) and memory.reaches(tick, k):
-            return tick
-        while memory.reaches(tick, k) is False:  # the first moments, or after a leap in time
-            tick += 1
-        return tick
+        return memory.measure_yaw_rate(k - self._gyro_ticks, yaw_rate, variance, k)
 
     def _arrival(
         self,

@@ -18,17 +18,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.angles import wrap
 from systems.compiled import compiled, in_rows, packed
-from systems.estimators.planar_kalman import UNKNOWN, mahalanobis
-from systems.small_matrices import congruence
+from systems.estimators.planar_kalman import UNKNOWN
+from systems.small_matrices import congruence, solve_positive
 
 Array = NDArray[np.float64]
 
 SIZE = 6
 THETA, BIAS, SCALE, GYRO_SCALE = 2, 3, 4, 5
 
-_IDENTITY = np.eye(SIZE)
+VERDICTS = ("started", "accepted", "gated", "ambiguous")  # the last: refused for that
+_STARTED, _ACCEPTED, _GATED, _AMBIGUOUS = range(4)
 
 
 class Drive(NamedTuple):
@@ -108,7 +108,8 @@ def predict(
         The state and F P F' + G Q G' after the step.
     """
     predicted, grown = np.empty(SIZE), np.empty((SIZE, SIZE))
-    _predict(packed(x), in_rows(P, SIZE), *drive, dt, *noise, predicted, grown)
+    step = np.array([*drive, dt])
+    predict_into(packed(x), in_rows(P, SIZE), step, np.array(noise), predicted, grown)
     return predicted, grown
 
 
@@ -152,44 +153,36 @@ def _linearize(
     predicted[THETA] = math.pi - (math.pi - theta - turn) % (2 * math.pi)
 
 
-@compiled(
-    "void(f8[::1], f8[:,::1], f8, f8, f8, f8, f8, f8,"
-    " f8, f8, f8, f8, f8, f8, f8, f8, f8[::1], f8[:,::1])"
-)
-def _predict(
-    x: Array,
-    P: Array,
-    speed: float,
-    yaw_rate: float,
-    speed_variance: float,
-    turn_variance: float,
-    gyro_weight: float,
-    dt: float,
-    speed_noise: float,
-    slip_noise: float,
-    side_noise: float,
-    gyro_noise: float,
-    turn_noise: float,
-    bias_noise: float,
-    scale_noise: float,
-    gyro_scale_noise: float,
-    predicted: Array,
-    grown: Array,
+@compiled("void(f8[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], f8[:,::1])")
+def predict_into(
+    x: Array, P: Array, step: Array, noise: Array, predicted: Array, grown: Array
 ) -> None:
-    """Writes state and covariance after a step; the entries of `Drive`, dt, of `ProcessNoise`."""
-    F, G, noise = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE))
+    """Writes what `predict` returns, not into x or P; for compiled callers.
+
+    Args:
+        x: (6,).
+        P: (6, 6).
+        step: (6,) the entries of `Drive`, then dt.
+        noise: (8,) the entries of `ProcessNoise`.
+        predicted: (6,), written.
+        grown: (6, 6), written.
+    """
+    speed, yaw_rate, speed_variance, turn_variance, gyro_weight, dt = step
+    speed_noise, slip_noise, side_noise, gyro_noise, turn_noise = noise[:5]
+    F, G, added = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE))
     _linearize(x, speed, yaw_rate, dt, F, G, predicted)
     v, omega = abs(speed), abs(yaw_rate)
     Q = np.zeros((SIZE, SIZE))
     Q[0, 0] = (speed_noise + slip_noise * v + speed_variance) * dt
     Q[1, 1] = side_noise * omega * dt
     Q[2, 2] = ((gyro_noise + turn_noise * omega) * gyro_weight + turn_variance) * dt
-    Q[3, 3], Q[4, 4], Q[5, 5] = bias_noise * dt, scale_noise * dt, gyro_scale_noise * dt
-    congruence(G, Q, noise)
+    for i in range(3, SIZE):
+        Q[i, i] = noise[2 + i] * dt
+    congruence(G, Q, added)
     congruence(F, P, grown)
     for i in range(SIZE):
         for j in range(SIZE):
-            grown[i, j] += noise[i, j]
+            grown[i, j] += added[i, j]
 
 
 def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
@@ -207,15 +200,41 @@ def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
     Returns:
         The corrected state and covariance.
     """
-    y = z - x[:3]
-    y[2] = wrap(float(y[2]))
-    K = np.linalg.solve(P[:3, :3] + R, P[:3]).T
-    A = _IDENTITY.copy()
-    A[:, :3] -= K
-    corrected = x + K @ y
-    corrected[THETA] = wrap(float(corrected[THETA]))
-    P = A @ P @ A.T + K @ R @ K.T
-    return corrected, (P + P.T) / 2
+    corrected, reduced = np.empty(SIZE), np.empty((SIZE, SIZE))
+    if not _update(packed(x), in_rows(P, SIZE), packed(z), in_rows(R, 3), corrected, reduced):
+        raise np.linalg.LinAlgError("P + R is not positive definite")
+    return corrected, reduced
+
+
+@compiled()
+def _wrap(angle: float) -> float:
+    return math.pi - (math.pi - angle) % (2 * math.pi)
+
+
+@compiled("b1(f8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[:,::1])")
+def _update(x: Array, P: Array, z: Array, R: Array, corrected: Array, reduced: Array) -> bool:
+    K, S, noise = np.empty((SIZE, 3)), np.empty((3, 3)), np.empty((SIZE, SIZE))
+    for i in range(SIZE):
+        for j in range(3):
+            K[i, j] = P[i, j]
+            for k in range(3):
+                S[j, k] = P[j, k] + R[j, k]
+        if not solve_positive(S, K[i]):
+            return False
+    A = np.zeros((SIZE, SIZE))
+    dx, dy, turn = z[0] - x[0], z[1] - x[1], _wrap(z[2] - x[2])
+    for i in range(SIZE):
+        A[i, i] = 1.0
+        for j in range(3):
+            A[i, j] -= K[i, j]
+        corrected[i] = x[i] + K[i, 0] * dx + K[i, 1] * dy + K[i, 2] * turn
+    corrected[THETA] = _wrap(corrected[THETA])
+    congruence(A, P, reduced)
+    congruence(K, R, noise)
+    for i in range(SIZE):
+        for j in range(SIZE):
+            reduced[i, j] += noise[i, j]
+    return True
 
 
 @dataclass(frozen=True, eq=False)
@@ -240,7 +259,7 @@ class Correction:
     """What became of a measurement.
 
     Attributes:
-        verdict: `started`, `accepted`, `gated` or `ambiguous` (refused for that).
+        verdict: one of `VERDICTS`.
         x: (6,) state after it.
         P: (6, 6) covariance after it.
         nis: squared Mahalanobis distance by degrees of freedom; NaN if none was looked at.
@@ -278,26 +297,81 @@ def correct(
         take_ambiguous: whether the nearer solution of an ambiguous picture is taken. A start needs
             one that is not ambiguous.
     """
-    known = is_known(P)
-    if measurement.ambiguous and not (known and take_ambiguous):
-        return Correction("ambiguous", x, P, math.nan, x, P)
-    poses = measurement.poses
-    v, theta = float(x[SCALE]) * drive.speed, float(x[THETA] if known else poses[0, THETA])
-    omega = float(x[GYRO_SCALE] * (drive.yaw_rate - x[BIAS]))
-    velocity = np.array([v * math.cos(theta), v * math.sin(theta), omega])
+    rules = np.array([stamp_variance, gate, float(take_ambiguous)])
+    corrected, reduced = np.empty(SIZE), np.empty((SIZE, SIZE))
+    verdict, nis = correct_into(
+        packed(x), in_rows(P, SIZE), in_rows(measurement.poses, 3),
+        in_rows(measurement.covariances, 3, 3), measurement.ambiguous, drive.speed,
+        drive.yaw_rate, rules, corrected, reduced,
+    )  # fmt: skip
+    return Correction(VERDICTS[verdict], corrected, reduced, nis, x, P)
+
+
+@compiled(
+    "Tuple((i8, f8))(f8[::1], f8[:,::1], f8[:,::1], f8[:,:,::1], b1, f8, f8, f8[::1],"
+    " f8[::1], f8[:,::1])"
+)
+def correct_into(
+    x: Array,
+    P: Array,
+    poses: Array,
+    covariances: Array,
+    ambiguous: bool,
+    speed: float,
+    yaw_rate: float,
+    rules: Array,
+    corrected: Array,
+    reduced: Array,
+) -> tuple[int, float]:
+    """Writes state and covariance of what `correct` returns, not into x or P; for compiled callers.
+
+    Args:
+        x: (6,).
+        P: (6, 6).
+        poses: (1 or 2, 3).
+        covariances: (1 or 2, 3, 3).
+        ambiguous: see `Measurement`.
+        speed: see `Drive`.
+        yaw_rate: see `Drive`.
+        rules: (3,) variance of the stamp (s^2), gate, and 1 or 0 for `take_ambiguous`.
+        corrected: (6,), written.
+        reduced: (6, 6), written.
+
+    Returns:
+        Index of the verdict in `VERDICTS`, and NIS.
+    """
+    stamp_variance, gate = rules[0], rules[1]
+    corrected[:], reduced[:] = x, P
+    known = P[0, 0] < UNKNOWN
+    if ambiguous and not (known and rules[2] > 0):
+        return _AMBIGUOUS, math.nan
+    theta = x[THETA] if known else poses[0, THETA]
     # Taken a moment earlier or later, it would show a pose further back or ahead.
-    covariances = measurement.covariances + stamp_variance * np.outer(velocity, velocity)
-    if not known:
-        start, P_start = x.copy(), P.copy()
-        start[:3], P_start[:3, :3] = poses[0], covariances[0]
-        return Correction("started", start, P_start, math.nan, x, P)
-    choices = len(poses) if measurement.ambiguous else 1
-    distances = [mahalanobis(x[:3], P[:3, :3], poses[i], covariances[i]) for i in range(choices)]
-    nearest = int(np.argmin(distances))
-    nis = distances[nearest] / 3
-    if distances[nearest] > gate:
-        return Correction("gated", x, P, nis, x, P)
-    return Correction("accepted", *update(x, P, poses[nearest], covariances[nearest]), nis, x, P)
+    velocity = (
+        x[SCALE] * speed * math.cos(theta),
+        x[SCALE] * speed * math.sin(theta),
+        x[GYRO_SCALE] * (yaw_rate - x[BIAS]),
+    )
+    R, S, y = np.empty((len(poses), 3, 3)), np.empty((3, 3)), np.empty(3)
+    nearest, least = 0, math.inf
+    for n in range(len(poses) if ambiguous else 1):
+        for i in range(3):
+            y[i] = poses[n, i] - x[i]
+            for j in range(3):
+                R[n, i, j] = covariances[n, i, j] + stamp_variance * velocity[i] * velocity[j]
+                S[i, j] = P[i, j] + R[n, i, j]
+        if not known:
+            corrected[:3], reduced[:3, :3] = poses[0], R[0]
+            return _STARTED, math.nan
+        y[THETA] = _wrap(y[THETA])
+        dx, dy, turn = y
+        if solve_positive(S, y):
+            distance = dx * y[0] + dy * y[1] + turn * y[2]
+            if distance < least:
+                nearest, least = n, distance
+    if not least <= gate or not _update(x, P, poses[nearest], R[nearest], corrected, reduced):
+        return _GATED, least / 3
+    return _ACCEPTED, least / 3
 
 
 def is_covariance(R: Array) -> bool:
