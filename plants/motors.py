@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
-from systems.compiled import compiled, in_rows
+from systems.compiled import compiled, in_rows, packed
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -113,6 +113,8 @@ class MotorModel:
         damping: steepest slope of torque by speed, N m s/rad.
         inertia: of the rotor as the wheel feels it, kg m^2.
         max_speed: of the slower wheel without load at full duty, rad/s.
+        figures: (4,) battery's and bridge's voltage (V), resistance (Ohm), 1 if chopped at the
+            enable pins: what `_currents` takes.
     """
 
     def __init__(self, parameters: MotorParameters, gain: ArrayLike = 1.0) -> None:
@@ -127,6 +129,8 @@ class MotorModel:
         self.damping = float(np.max(self.torque_constant * self.back_emf / self.resistance))
         self.inertia = p.rotor_inertia * p.gear_ratio**2
         self._voltage_lost = p.no_load_current * self.resistance
+        at_enable = float(p.chopped == "enable")
+        self.figures = np.array([p.battery_voltage, p.bridge_voltage, self.resistance, at_enable])
         self.max_speed = float(np.min(self.steady_speed(1.0)))
 
     def current(self, duty: ArrayLike, speed: ArrayLike) -> Array:
@@ -139,19 +143,15 @@ class MotorModel:
         while the difference is less than U_0.
 
         Args:
-            duty: -1 to 1.
+            duty: -1 to 1; beyond that it counts as that.
             speed: of the wheel, rad/s.
         """
-        p = self.parameters
-        d, emf = np.asarray(duty, float), np.asarray(self.back_emf * np.asarray(speed, float))
-        if d.shape != emf.shape:
-            d, emf = np.broadcast_arrays(d, emf)
-        voltages = np.empty(d.size)
-        _voltages(
-            in_rows(d), in_rows(emf), p.battery_voltage, p.bridge_voltage,
-            p.chopped == "enable", voltages,
-        )  # fmt: skip
-        return voltages.reshape(d.shape) / self.resistance
+        d, w, k_e = np.broadcast_arrays(
+            np.asarray(duty, float), np.asarray(speed, float), self.back_emf
+        )
+        currents = np.empty(d.size)
+        _currents(in_rows(d), in_rows(w), in_rows(k_e), self.figures, currents)
+        return currents.reshape(d.shape)
 
     def torque(self, duty: ArrayLike, speed: ArrayLike) -> Array:
         """Returns the torque at the wheel before the gear's friction, N m (see `current`)."""
@@ -191,19 +191,18 @@ class MotorModel:
         return np.asarray(np.sign(speed) * np.minimum(size, 1.0))
 
 
-@compiled("void(f8[::1], f8[::1], f8, f8, b1, f8[::1])")
-def _voltages(
-    duty: Array, emf: Array, battery: float, bridge: float, at_enable: bool, voltages: Array
-) -> None:
-    """Writes the mean voltage over the resistance (see `MotorModel.current`)."""
+@compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")
+def _currents(duty: Array, speed: Array, back_emf: Array, figures: Array, currents: Array) -> None:
+    battery, bridge, resistance, at_enable = figures
     for k in range(len(duty)):
-        d = duty[k]
+        d, emf = min(max(duty[k], -1.0), 1.0), back_emf[k] * speed[k]
         if at_enable:
-            against = emf[k] if d > 0 else -emf[k]
-            voltages[k] = d * max(battery - bridge - against, 0.0)
+            against = emf if d > 0 else -emf
+            voltage = d * max(battery - bridge - against, 0.0)
         else:
-            over = d * battery - emf[k]
-            voltages[k] = math.copysign(max(abs(over) - bridge, 0.0), over)
+            over = d * battery - emf
+            voltage = math.copysign(max(abs(over) - bridge, 0.0), over)
+        currents[k] = voltage / resistance
 
 
 class DcMotors(LeafSystem):
@@ -247,7 +246,7 @@ class DcMotors(LeafSystem):
         p = parameters or MotorParameters()
         self._model = MotorModel(p, [p.right_gain, p.left_gain])
         # The servo's gain is that of the nominal motor, for both.
-        self._damping = MotorModel(p).damping
+        self._by_current = self._model.torque_constant / MotorModel(p).damping
         self._pwm_input = self.DeclareVectorInputPort("pwm", 2)
         self._speeds_input = self.DeclareVectorInputPort("wheel_speeds", 2)
         both = {self._pwm_input.ticket(), self._speeds_input.ticket()}
@@ -286,20 +285,25 @@ class DcMotors(LeafSystem):
 
     def _duty(self, context: Context) -> Array:
         duty: Array = self._pwm_input.Eval(context) / PWM_LEVELS
-        return np.minimum(np.maximum(duty, -1.0), 1.0)
+        return duty
+
+    def _current(self, context: Context, speeds: Array) -> Array:
+        current = np.empty(2)
+        model = self._model
+        _currents(self._duty(context), packed(speeds), model.back_emf, model.figures, current)
+        return current
 
     def _calc_torque(self, context: Context, output: Any) -> None:
-        speeds = self._speeds_input.Eval(context)
-        output.SetFromVector(self._model.torque(self._duty(context), speeds))
+        current = self._current(context, self._speeds_input.Eval(context))
+        output.SetFromVector(self._model.torque_constant * current)
 
     def _calc_current(self, context: Context, output: Any) -> None:
-        speeds = self._speeds_input.Eval(context)
-        output.SetFromVector(self._model.current(self._duty(context), speeds))
+        output.SetFromVector(self._current(context, self._speeds_input.Eval(context)))
 
     def _calc_servo_speeds(self, context: Context, output: Any) -> None:
         speeds = self._speeds_input.Eval(context)
-        torque = self._model.torque(self._duty(context), speeds)
-        output.SetFromVector(speeds + torque / self._damping)
+        output.SetFromVector(speeds + self._by_current * self._current(context, speeds))
 
     def _calc_steady_speeds(self, context: Context, output: Any) -> None:
-        output.SetFromVector(self._model.steady_speed(self._duty(context)))
+        duty = np.clip(self._duty(context), -1.0, 1.0)
+        output.SetFromVector(self._model.steady_speed(duty))
