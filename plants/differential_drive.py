@@ -261,7 +261,7 @@ def KinematicDifferentialDrive_(T: Any) -> Any:  # noqa: D103 - the class carrie
         def DoCalcTimeDerivatives(self, context: Any, derivatives: Any) -> None:
             theta = context.get_continuous_state_vector().GetAtIndex(2)
             v, omega = self._velocity(context)
-            derivatives.get_mutable_vector().SetFromVector([v * cos(theta), v * sin(theta), omega])
+            derivatives.SetFromVector([v * cos(theta), v * sin(theta), omega])
 
     return Impl
 

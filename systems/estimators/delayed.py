@@ -164,16 +164,14 @@ def _begin(rows: Array, k: int, x: Array, P: Array, drive: Array) -> None:
 def _reaches(rows: Array, first: int, last: int) -> bool:
     if last - first >= len(rows):
         return False
-    for k in range(first, last + 1):
-        if rows[k % len(rows), _TICK] != k:
-            return False
-    return True
+    k = first
+    while k <= last and rows[k % len(rows), _TICK] == k:
+        k += 1
+    return k > last
 
 
 @compiled("i8(f8[:,::1], i8, f8, f8, i8)")
-def _measure_yaw_rate(
-    rows: Array, k: int, yaw_rate: float, turn_variance: float, last: int
-) -> int:
+def _measure_yaw_rate(rows: Array, k: int, yaw_rate: float, turn_variance: float, last: int) -> int:
     row = rows[k % len(rows)]
     if row[_TICK] == k:
         row[_YAW_RATE] = row[_EXPECTED] if math.isnan(yaw_rate) else yaw_rate
@@ -267,8 +265,8 @@ def _replay(
                     predict_into(x, P, step, noise, next_x, next_P)
                     x[:], P[:] = next_x, next_P
             number = 1 if math.isnan(told[_FIRST_POSE + 3]) else 2
-            poses = told[_FIRST_POSE : _FIRST_COVARIANCE].reshape(2, 3)[:number]
-            covariances = told[_FIRST_COVARIANCE : _FIRST_X].reshape(2, 3, 3)[:number]
+            poses = told[_FIRST_POSE:_FIRST_COVARIANCE].reshape(2, 3)[:number]
+            covariances = told[_FIRST_COVARIANCE:_FIRST_X].reshape(2, 3, 3)[:number]
             found, distance = correct_into(
                 x, P, poses, covariances, told[_AMBIGUOUS] > 0, step[0], yaw_rate, rules,
                 next_x, next_P,

@@ -6,6 +6,7 @@ who is a landmark and who a stranger in `formation_belief`; here is the block.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
@@ -174,9 +175,9 @@ class FormationFilter(LeafSystem):
         t = context.get_time()
         belief = self._belief(context)
         counts: Counter[str] = Counter()
-        moving = self._moving_input.Eval(context)
-        for robot, (now, before) in enumerate(zip(moving, belief.moving, strict=True)):
-            if not np.isfinite(now):
+        moving = self._moving_input.Eval(context).tolist()
+        for robot, (now, before) in enumerate(zip(moving, belief.moving.tolist(), strict=True)):
+            if not math.isfinite(now):
                 counts["bad_moving"] += 1
             elif now and not before:
                 self._estimator.depart(belief, robot, t)

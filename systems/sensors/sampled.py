@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from abc import abstractmethod
+from dataclasses import dataclass
 from typing import Any
 
 from pydrake.common.value import AbstractValue
@@ -24,6 +25,16 @@ from systems.validation import require, require_non_negative, require_positive
 # event out when another one lies a rounding error before it: one in a thousand messages would not
 # arrive. A nanosecond early nothing else is near, and who looks at the time of arrival sees it.
 _EARLY = 1e-9  # s
+
+
+@dataclass(frozen=True, eq=False)
+class _UnderWay(Message):
+    """What has been measured and has not arrived: (time of arrival (s), message), in that order.
+
+    A message itself, for Drake copies all abstract state at each change of any of it.
+    """
+
+    samples: tuple[tuple[float, Message], ...] = ()
 
 
 class SampledSensor(LeafSystem):
@@ -72,7 +83,7 @@ class SampledSensor(LeafSystem):
         self.clock_error = clock_error
         self._active_input = self.DeclareVectorInputPort("active", 1) if switchable else None
         self._delivered = self.DeclareAbstractState(AbstractValue.Make(nothing))
-        self._under_way = self.DeclareAbstractState(AbstractValue.Make(()))
+        self._under_way = self.DeclareAbstractState(AbstractValue.Make(_UnderWay()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._take)
         self.DeclarePeriodicUnrestrictedUpdateEvent(
             1.0 / rate, max(latency - _EARLY, 0.0), self._deliver
@@ -106,10 +117,10 @@ class SampledSensor(LeafSystem):
         return self._active_input
 
     def _is_off(self, context: Context) -> bool:
-        if self._active_input is None:
+        port = self._active_input
+        if port is None or not port.HasValue(context):
             return False
-        active = self.EvalVectorInput(context, self._active_input.get_index())
-        return active is not None and not active[0] > 0
+        return not port.Eval(context)[0] > 0
 
     def _take(self, context: Context, state: State) -> EventStatus:
         if self._is_off(context):
@@ -117,16 +128,17 @@ class SampledSensor(LeafSystem):
         t = context.get_time()
         message = self._measure(context, self._stamp(t), sample_index(t, self.rate))
         slot = self._slot(state, self._under_way)
-        slot.set_value((*slot.get_value(), (t + self.latency, message)))
+        slot.set_value(_UnderWay((*slot.get_value().samples, (t + self.latency, message))))
         return EventStatus.Succeeded()
 
     def _deliver(self, context: Context, state: State) -> EventStatus:
         slot = self._slot(state, self._under_way)
         now = context.get_time() + 2 * _EARLY
-        arrived = [message for due, message in slot.get_value() if due <= now]
+        samples = slot.get_value().samples
+        arrived = [message for due, message in samples if due <= now]
         if not arrived:  # it was off, or the simulation started late: there was no sample
             return EventStatus.DidNothing()
-        slot.set_value(slot.get_value()[len(arrived) :])
+        slot.set_value(_UnderWay(samples[len(arrived) :]))
         self._slot(state, self._delivered).set_value(arrived[-1])
         return EventStatus.Succeeded()
 
