@@ -21,28 +21,31 @@ from systems.messages import Message, whole_nanoseconds
 from systems.noise import sample_index
 from systems.validation import require, require_non_negative, require_positive
 
-# Drake computes the next time of an event that has an offset from the present time, and leaves the
-# event out when another one lies a rounding error before it: one in a thousand messages would not
-# arrive. A nanosecond early nothing else is near, and who looks at the time of arrival sees it.
-_EARLY = 1e-9  # s
+_ROUNDING = 1e-9  # s, by which the time at which somebody looks may be before that of an arrival
 
 
 @dataclass(frozen=True, eq=False)
-class _UnderWay(Message):
-    """What has been measured and has not arrived: (time of arrival (s), message), in that order.
+class _Samples(Message):
+    """The last sample that has arrived and those under way: (time of arrival (s), message).
 
     A message itself, for Drake copies all abstract state at each change of any of it.
     """
 
     samples: tuple[tuple[float, Message], ...] = ()
 
+    def arrived(self, t: float) -> int:
+        """Returns how many have arrived at time t (s)."""
+        return sum(due <= t + _ROUNDING for due, _ in self.samples)
+
 
 class SampledSensor(LeafSystem):
     """Base of sensors that measure a message at `rate` and deliver it `latency` later.
 
-    A subclass declares its inputs, calls `_declare_sampling` and implements `_measure`. The
-    delivered message and those under way are abstract state; before the first delivery the output
-    is `nothing`.
+    A subclass declares its inputs, calls `_declare_sampling` and implements `_measure`. The last
+    message that has arrived and those under way are abstract state. Which has arrived is a matter
+    of the time: an event of its own for that would be one more step of the simulation, and where
+    it coincides with others Drake rounds its time, and leaves one in a thousand out. Before the
+    first arrival the output is `nothing`.
     """
 
     def _declare_sampling(
@@ -69,7 +72,8 @@ class SampledSensor(LeafSystem):
                 measured; unconnected, it measures.
 
         Returns:
-            The output port. It changes only when a message arrives.
+            The output port. It changes only when a message arrives, though for Drake it depends
+            on the time.
 
         Raises:
             ValueError: rate, latency or clock_error out of range.
@@ -82,19 +86,14 @@ class SampledSensor(LeafSystem):
         self.latency = latency
         self.clock_error = clock_error
         self._active_input = self.DeclareVectorInputPort("active", 1) if switchable else None
-        self._delivered = self.DeclareAbstractState(AbstractValue.Make(nothing))
-        self._under_way = self.DeclareAbstractState(AbstractValue.Make(_UnderWay()))
+        self._nothing = nothing
+        self._samples = self.DeclareAbstractState(AbstractValue.Make(_Samples()))
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._take)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(
-            1.0 / rate, max(latency - _EARLY, 0.0), self._deliver
-        )
         return self.DeclareAbstractOutputPort(
             name,
             lambda: AbstractValue.Make(nothing),
-            lambda context, output: output.set_value(
-                context.get_abstract_state(self._delivered).get_value()
-            ),
-            {self.abstract_state_ticket(self._delivered)},
+            self._calc_arrived,
+            {self.abstract_state_ticket(self._samples), self.time_ticket()},
         )
 
     @abstractmethod
@@ -127,21 +126,13 @@ class SampledSensor(LeafSystem):
             return EventStatus.DidNothing()
         t = context.get_time()
         message = self._measure(context, self._stamp(t), sample_index(t, self.rate))
-        slot = self._slot(state, self._under_way)
-        slot.set_value(_UnderWay((*slot.get_value().samples, (t + self.latency, message))))
+        slot: AbstractValue = state.get_mutable_abstract_state(int(self._samples))
+        before: _Samples = slot.get_value()
+        kept = before.samples[max(before.arrived(t) - 1, 0) :]
+        slot.set_value(_Samples((*kept, (t + self.latency, message))))
         return EventStatus.Succeeded()
 
-    def _deliver(self, context: Context, state: State) -> EventStatus:
-        slot = self._slot(state, self._under_way)
-        now = context.get_time() + 2 * _EARLY
-        samples = slot.get_value().samples
-        arrived = [message for due, message in samples if due <= now]
-        if not arrived:  # it was off, or the simulation started late: there was no sample
-            return EventStatus.DidNothing()
-        slot.set_value(_UnderWay(samples[len(arrived) :]))
-        self._slot(state, self._delivered).set_value(arrived[-1])
-        return EventStatus.Succeeded()
-
-    @staticmethod
-    def _slot(state: State, index: Any) -> AbstractValue:
-        return state.get_mutable_abstract_state(int(index))
+    def _calc_arrived(self, context: Context, output: Any) -> None:
+        found: _Samples = context.get_abstract_state(int(self._samples)).get_value()
+        arrived = found.arrived(context.get_time())
+        output.set_value(found.samples[arrived - 1][1] if arrived else self._nothing)
