@@ -141,6 +141,8 @@ def relocate(scene: Scene, sightings: Sightings, frames: Indices, limit: float) 
         agree = (error < (4 * limit) ** 2).sum(axis=1)
         for k in np.argsort(-agree, kind="stable")[:2]:
             near = error[k] < (4 * limit) ** 2
+            if not near.any():  # a tag alone, misread: no pose has it square
+                break
             refined = refine(
                 choices.R[[k]],
                 choices.p[[k]],
