@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.math import RigidTransform, RotationMatrix
 
+from diagrams.mapping_frames import frame_rows, worst_frames, write_frames
 from diagrams.mapping_plots import plot_map
 from diagrams.mapping_source import Observed, observe, wheel_odometry
 from diagrams.mapping_viewer import show_map
@@ -26,6 +27,7 @@ from systems.mapping.camera_check import Freed, suspect_camera
 from systems.mapping.gathering import Gathered, gather
 from systems.mapping.mapping import MappingParameters, TagMap, build_map
 from systems.mapping.odometry import motion_of_odometry
+from systems.mapping.residuals import Residuals, residuals_of
 from systems.mapping.trajectory import Trajectory, trajectory
 from systems.markers.layout import Marker, MarkerMap, load_map
 from systems.messages import Detections
@@ -37,6 +39,7 @@ RESULTS = (
     "map.json",
     "trajectory.tum",
     "covariances.npz",
+    "frames.csv",
     "report.json",
     "summary.png",
     "replay.html",
@@ -104,7 +107,8 @@ def map_recording(
     of the frame that the recording's /tf_static mounts it on. `covariances.npz` holds the marginal
     covariances of both (`ids`, `tags` (n, 6, 6); `stamps`, `poses` (m, 6, 6); rotation first, as a
     small rotation vector in the map's frame, then the position). A map that cannot be trusted is
-    not written: the report says why.
+    not written: the report says why. The report has the residuals by tag and of the worst frames;
+    `frames.csv` has them of every frame (see `mapping_frames`), also where the map is refused.
 
     Args:
         recording: see `diagrams.mapping_source.observe`.
@@ -175,6 +179,8 @@ def map_recording(
     if connected_only:
         reasons.pop("disconnected", None)
     path, ambiguous = trajectory(tag_map, X_BC=observed.X_BC, margin=parameters.flip_margin)
+    of_tags, of_frames = residuals_of(tag_map)
+    frames = frame_rows(tag_map, of_frames, path)
     outcome = "refused" if reasons else "localized" if localize_only else "mapped"
     report = {
         "recording": str(recording),
@@ -200,11 +206,13 @@ def map_recording(
             "trajectory_of": observed.body or observed.frame_id or "camera",
         },
         "camera": camera_row(observed.camera, freed),
-        "tags": tag_rows(tag_map),
+        "tags": tag_rows(tag_map, of_tags),
+        "worst_frames": worst_frames(frames),
     }
     marker_map = as_marker_map(tag_map, observed, sizes, given)
     _write(out, reasons, marker_map, tag_map, path, localize_only)
-    plot_map(out / "summary.png", tag_map, path, marker_map, report)
+    write_frames(out / "frames.csv", frames)
+    plot_map(out / "summary.png", tag_map, path, marker_map, report, frames)
     if meshcat is not None:
         show_map(meshcat, marker_map, path, observed.X_BC)
         (out / "replay.html").write_text(meshcat.StaticHtml())
@@ -241,27 +249,31 @@ def camera_row(camera: PinholeCamera, freed: Freed) -> dict[str, float]:
     }
 
 
-def tag_rows(tag_map: TagMap) -> list[dict[str, Any]]:
+def tag_rows(tag_map: TagMap, of_tags: Residuals) -> list[dict[str, Any]]:
     """Returns for each tag how often it was seen, its residuals and standard deviations."""
-    s, squared = tag_map.sightings, tag_map.adjustment.squared
-    count = np.bincount(s.tag, minlength=s.tags)
-    total = np.bincount(s.tag, squared, minlength=s.tags)
-    rms = np.sqrt(total / np.maximum(4 * count, 1)) * tag_map.pixel_noise
-    P = tag_map.adjustment.tag_covariance
-    turn, place = (
-        np.sqrt(np.maximum(np.trace(part, axis1=1, axis2=2), 0.0))
-        for part in (P[:, :3, :3], P[:, 3:, 3:])
-    )
+    turn, place = _tag_sigmas(tag_map)
     return [
         {
             "ID": int(marker_id),
-            "sightings": int(count[k]),
-            "reprojection_rms_px": float(rms[k]),
+            "sightings": int(of_tags.used[k]),
+            "outliers": int(of_tags.outliers[k]),
+            "reprojection_rms_px": float(of_tags.rms[k]),
+            "largest_px": float(of_tags.largest[k]),
             "sigma_deg": math.degrees(turn[k]),
             "sigma_m": float(place[k]),
         }
         for k, marker_id in enumerate(tag_map.ids)
     ]
+
+
+def _tag_sigmas(tag_map: TagMap) -> tuple[Array, Array]:
+    """Returns (tags,) standard deviations of the rotation, rad, and of the position, m."""
+    P = tag_map.adjustment.tag_covariance
+    turn, place = (
+        np.sqrt(np.maximum(np.trace(part, axis1=1, axis2=2), 0.0))
+        for part in (P[:, :3, :3], P[:, 3:, 3:])
+    )
+    return turn, place
 
 
 def _metrics(tag_map: TagMap, path: Trajectory) -> dict[str, float | int]:
@@ -273,7 +285,7 @@ def _metrics(tag_map: TagMap, path: Trajectory) -> dict[str, float | int]:
         "pixel_noise_px": tag_map.pixel_noise,
         "tags": len(tag_map.ids),
         "frames": len(path),
-        "tag_sigma_max_m": max(row["sigma_m"] for row in tag_rows(tag_map)),
+        "tag_sigma_max_m": float(_tag_sigmas(tag_map)[1].max()),
         "pose_sigma_median_m": float(np.median(sigma)) if len(sigma) else math.nan,
     }
 

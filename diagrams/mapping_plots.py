@@ -27,6 +27,7 @@ def plot_map(
     way: Trajectory,
     marker_map: MarkerMap,
     report: dict[str, Any],
+    frames: list[dict[str, Any]],
 ) -> None:
     """Writes the figure of a map.
 
@@ -36,13 +37,15 @@ def plot_map(
         way: of camera or body.
         marker_map: its tags, and known ones that were not seen.
         report: as `report.json` has it.
+        frames: as `frames.csv` has them.
     """
-    figure = Figure(figsize=(12.5, 7.0), layout="constrained")
+    figure = Figure(figsize=(12.5, 8.0), layout="constrained")
     FigureCanvasAgg(figure)
     left, right = cast(NDArray[Any], figure.subfigures(1, 2, width_ratios=[1.15, 1.0]))
     _plan(left.subplots(), way, marker_map, report["map"])
-    histogram, rms, sigma = right.subplots(3, 1, height_ratios=[1.2, 1.0, 1.0])
+    histogram, time, rms, sigma = right.subplots(4, 1, height_ratios=[1.2, 1.0, 1.0, 1.0])
     _residuals(histogram, tag_map)
+    _over_time(time, frames)
     _bars(rms, sigma, report["tags"])
     metrics, title = report["metrics"], report["outcome"]
     title += f": {metrics['tags']} tags, {metrics['frames']} frames, "
@@ -114,6 +117,22 @@ def _residuals(ax: Axes, tag_map: TagMap) -> None:
             label=f"noise of {noise:.2f} px in x and y")  # fmt: skip
     ax.set(xlabel="distance of a corner from where the map has it [px]", ylabel="corners")
     ax.legend(fontsize=8)
+    ax.grid(alpha=0.3)
+
+
+def _over_time(ax: Axes, frames: list[dict[str, Any]]) -> None:
+    t, rms, outliers = (
+        np.array([row[key] for row in frames])
+        for key in ("time", "reprojection_rms_px", "outliers")
+    )
+    ax.plot(t - t[0], rms, ".", markersize=3, color="tab:blue", label="frame")
+    some = outliers > 0
+    if some.any():
+        ax.plot((t - t[0])[some], np.nan_to_num(rms[some]), "x", color="tab:red", markersize=5,
+                label="one with tags that do not fit, left out")  # fmt: skip
+    ax.set(xlabel="time [s]", ylabel="residual\nRMS [px]")
+    ax.set_ylim(0.0, 1.25 * ax.get_ylim()[1])  # room for the legend
+    ax.legend(fontsize=8, ncol=2, loc="upper left")
     ax.grid(alpha=0.3)
 
 

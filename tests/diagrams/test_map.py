@@ -136,7 +136,7 @@ def test_a_recording_becomes_a_map(
     result = tagtrail("map", recording, "--size", SIZE, "--anchor", 0, "--out", out)
     assert (result.status, result.err) == (0, "")
     assert {path.name for path in out.iterdir()} == {
-        "map.json", "trajectory.tum", "covariances.npz", "report.json", "summary.png",
+        "map.json", "trajectory.tum", "covariances.npz", "frames.csv", "report.json", "summary.png",
         "replay.html",
     }  # fmt: skip
     found = load_map(out / "map.json")
@@ -157,7 +157,8 @@ def test_a_recording_becomes_a_map(
     assert error(found, world) < 4 * metrics["tag_sigma_max_m"]
     assert report["tags"][0] == {
         "ID": 0, "sightings": report["tags"][0]["sightings"],
-        "reprojection_rms_px": pytest.approx(0.4, abs=0.1), "sigma_deg": 0.0, "sigma_m": 0.0,
+        "outliers": 0, "reprojection_rms_px": pytest.approx(0.4, abs=0.1),
+        "largest_px": pytest.approx(1.1, abs=0.5), "sigma_deg": 0.0, "sigma_m": 0.0,
     }  # fmt: skip
     assert all(row["sigma_m"] > 0 and row["sigma_deg"] > 0 for row in report["tags"][1:])
     covariances = np.load(out / "covariances.npz")
