@@ -228,18 +228,22 @@ class Eye(LeafSystem):
 
 
 def ekf_parameters(slip: float = 0.05, yaw_noise: float = 0.1) -> PlanarEkfParameters:
-    """The filter of a robot that is known to slip about as much.
+    """The filter of a robot that is known to slip about as much, and to do nothing else.
 
     The scale walks away as fast as the slip wanders in the short run; of the ticks every fifth
-    begins with another yaw rate.
+    begins with another yaw rate. What a real robot does besides, and `SlippingRobot` does not, is
+    zero: noise of distance, side and turn, and errors of the gyro's scale.
     """
     return PlanarEkfParameters(
-        speed_noise=0.0005,
-        slip_noise=0.002,
-        side_noise=0.0005,
-        turn_noise=0.001,
-        scale_walk=0.7 * slip,
-        gyro_bias_std=0.02,
+        speed_noise=0.0,
+        slip_noise=0.0,
+        side_noise=0.0,
+        turn_noise=0.0,
+        scale_walk=slip / math.sqrt(2),
+        gyro_bias_std=Truth.gyro_bias,
+        gyro_bias_walk=0.0,
+        gyro_scale_std=0.0,
+        gyro_scale_walk=0.0,
         gyro_delay=0.0,
         yaw_rate_change=yaw_noise * math.sqrt(2 * CONTROL / RATE),
         stamp_noise=0.0,
