@@ -106,17 +106,17 @@ class GyroYaw(LeafSystem):
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         if context.get_time() < self._dt / 2:
             return  # the sensor takes its first sample in this very moment
-        sample = self._imu_input.Eval(context)
-        if not math.isfinite(sum(sample.tolist())):
+        sample = self._imu_input.Eval(context).tolist()
+        if not math.isfinite(sum(sample)):
             self._counts.add(context, discrete_state, bad_imu=1)
             return
-        total = context.get_discrete_state(self._sum).get_value()
-        if total[6] < self._num_samples:
-            discrete_state.set_value(self._sum, [*(total[:6] + sample), total[6] + 1])
+        total = discrete_state.get_mutable_value(self._sum)
+        number = float(total[6])
+        if number < self._num_samples:
+            total += [*sample, 1.0]
             return
-        yaw = float(context.get_discrete_state(self._yaw)[0])
-        yaw = wrap(yaw + (float(sample[2]) - float(total[2] / max(total[6], 1.0))) * self._dt)
-        discrete_state.set_value(self._yaw, [yaw])
+        yaw = discrete_state.get_mutable_value(self._yaw)
+        yaw[0] = wrap(float(yaw[0]) + (sample[2] - float(total[2]) / max(number, 1.0)) * self._dt)
 
     def _calc_sample(self, context: Context, output: Any) -> None:
         output.SetFromVector(self._corrected(context))
