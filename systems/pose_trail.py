@@ -37,16 +37,42 @@ def poses_at(trail: Array, times: Array) -> Array:
     Before the oldest pose the robot is taken to have stood there; after the newest, to stand there
     still. NaN when the trail has no pose.
     """
-    known = trail[np.isfinite(trail).all(axis=1)]
-    if len(known) == 0:
-        return np.full((len(times), 3), np.nan)
-    t, x, y, theta = known.T
-    if (np.abs(theta[1:] - theta[:-1]) > np.pi).any():
-        theta = np.unwrap(theta)
     poses = np.empty((len(times), 3))
-    for k, column in enumerate((x, y, theta)):
-        poses[:, k] = np.interp(times, t, column)
+    _poses_at(packed(trail), packed(times), poses)
     return poses
+
+
+@compiled("void(f8[:,::1], f8[::1], f8[:,::1])")
+def _poses_at(trail: Array, times: Array, poses: Array) -> None:
+    known = np.empty_like(trail)
+    n = 0
+    turns = 0.0  # what unwraps theta, rad
+    for k in range(len(trail)):
+        t, x, y, theta = trail[k, 0], trail[k, 1], trail[k, 2], trail[k, 3]
+        if not (math.isfinite(t) and math.isfinite(x + y + theta)):
+            continue
+        if n:
+            turn = theta + turns - known[n - 1, 3]
+            if abs(turn) > math.pi:
+                turns -= 2 * math.pi * math.floor(turn / (2 * math.pi) + 0.5)
+        known[n, 0], known[n, 1], known[n, 2], known[n, 3] = t, x, y, theta + turns
+        n += 1
+    if n == 0:
+        poses[:] = math.nan
+        return
+    j = 0  # of the pose before; the times mostly grow
+    for k in range(len(times)):
+        t = times[k]
+        while j > 0 and t < known[j, 0]:
+            j -= 1
+        while j < n - 1 and t >= known[j + 1, 0]:
+            j += 1
+        standing = t < known[0, 0] or j == n - 1
+        for i in range(3):
+            poses[k, i] = known[j, i + 1]
+            if not standing:
+                slope = (known[j + 1, i + 1] - known[j, i + 1]) / (known[j + 1, 0] - known[j, 0])
+                poses[k, i] += slope * (t - known[j, 0])
 
 
 def ray_poses(scan: Scan, lidar_pose: Array, trail: Array) -> Array:
@@ -60,17 +86,41 @@ def ray_poses(scan: Scan, lidar_pose: Array, trail: Array) -> Array:
     Returns:
         (n, 3) [x (m), y (m), direction (rad)].
     """
-    times = scan.stamp + scan.time_increment * np.arange(len(scan), dtype=float)
-    rays = poses_at(trail, times)
-    _carry(rays, packed(lidar_pose), packed(scan.angles))
+    rays = np.empty((len(scan), 3))
+    timing = np.array((scan.stamp, scan.time_increment, scan.angle_min, scan.angle_increment))
+    _ray_poses(packed(trail), packed(lidar_pose), timing, rays)
     return rays
 
 
-@compiled("void(f8[:,::1], f8[::1], f8[::1])")
-def _carry(poses: Array, lidar_pose: Array, angles: Array) -> None:
-    """Turns poses of the body (n, 3) into those of its lidar's rays."""
-    for k in range(len(poses)):
-        c, s = math.cos(poses[k, 2]), math.sin(poses[k, 2])
-        poses[k, 0] += c * lidar_pose[0] - s * lidar_pose[1]
-        poses[k, 1] += s * lidar_pose[0] + c * lidar_pose[1]
-        poses[k, 2] += lidar_pose[2] + angles[k]
+@compiled("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1])")
+def _ray_poses(trail: Array, lidar_pose: Array, timing: Array, rays: Array) -> None:
+    n = len(rays)
+    _poses_at(trail, timing[0] + timing[1] * np.arange(n), rays)
+    for k in range(n):
+        c, s = math.cos(rays[k, 2]), math.sin(rays[k, 2])
+        rays[k, 0] += c * lidar_pose[0] - s * lidar_pose[1]
+        rays[k, 1] += s * lidar_pose[0] + c * lidar_pose[1]
+        rays[k, 2] += lidar_pose[2] + (timing[2] + timing[3] * k)
+
+
+def ray_ends(scan: Scan, rays: Array) -> Array:
+    """Returns where the rays that hit something ended: (k, 2) m, in the frame of the rays.
+
+    Args:
+        scan: n rays; those that report less than range_min or more than range_max hit nothing.
+        rays: (n, 3), see `ray_poses`.
+    """
+    ends = np.empty((len(scan), 2))
+    limits = np.array((scan.range_min, scan.range_max))
+    return ends[: _ray_ends(packed(scan.ranges), limits, packed(rays), ends)]
+
+
+@compiled("i8(f8[::1], f8[::1], f8[:,::1], f8[:,::1])")
+def _ray_ends(ranges: Array, limits: Array, rays: Array, ends: Array) -> int:
+    n = 0
+    for k in range(len(ranges)):
+        if limits[0] <= ranges[k] <= limits[1] and ranges[k] < math.inf:
+            ends[n, 0] = rays[k, 0] + ranges[k] * math.cos(rays[k, 2])
+            ends[n, 1] = rays[k, 1] + ranges[k] * math.sin(rays[k, 2])
+            n += 1
+    return n

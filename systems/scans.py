@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from systems.compiled import compiled, packed
 from systems.messages import Scan
 
 Array = NDArray[np.float64]
@@ -30,17 +31,26 @@ def scan_fault(scan: Scan, now: float, max_age: float) -> str | None:
     if math.isnan(scan.stamp) or len(scan) == 0:
         return "no_scan"
     numbers = (scan.angle_min, scan.angle_increment, scan.time_increment, scan.range_min)
-    failed = np.isnan(scan.ranges)
     sound = (
-        all(math.isfinite(number) for number in numbers)
+        all(map(math.isfinite, numbers))
         and scan.angle_increment != 0
         and scan.range_max > scan.range_min  # not NaN either: no point would be left
-        and 2 * int(failed.sum()) <= len(scan)
-        and not (scan.ranges < 0).any()
+        and _are_ranges(packed(scan.ranges))
     )
     if not sound:
         return "garbled_scan"
     return "stale_scan" if not 0 <= now - scan.stamp + 1e-6 <= max_age else None
+
+
+@compiled("b1(f8[::1])")
+def _are_ranges(ranges: Array) -> bool:
+    """Tells whether none is negative, and at most half of them are NaN."""
+    failed = 0
+    for distance in ranges:
+        if distance < 0:
+            return False
+        failed += math.isnan(distance)
+    return 2 * failed <= len(ranges)
 
 
 def hits(scan: Scan) -> NDArray[np.intp]:

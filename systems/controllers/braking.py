@@ -100,12 +100,15 @@ def stopping_paths(
     Returns:
         (c, n, 3) poses in the body's frame of now, evenly in time until all stand.
     """
-    return _stopping_paths(packed(commands), packed(sent), packed(held), _times(parameters))
+    times, _ = as_arrays(parameters)
+    return _stopping_paths(packed(commands), packed(sent), packed(held), times)
 
 
-def _times(parameters: CollisionMonitorParameters) -> Array:
+def as_arrays(parameters: CollisionMonitorParameters) -> tuple[Array, Array]:
+    """Returns the times (4,) and the margins (2,), as compiled functions take them."""
     p = parameters
-    return np.array((p.deceleration, p.turn_deceleration, p.reaction_time, p.slowdown_time))
+    times = np.array((p.deceleration, p.turn_deceleration, p.reaction_time, p.slowdown_time))
+    return times, np.array((p.margin, p.contact_margin))
 
 
 @compiled()
@@ -165,17 +168,16 @@ def are_safe(
         hull: see `clearance`.
         parameters: margins, times and decelerations.
     """
-    margins = np.array((parameters.margin, parameters.contact_margin))
     safe = np.empty(len(commands), bool)
-    _are_safe(
+    mark_safe(
         packed(commands), packed(sent), packed(held), packed(points), packed(hull),
-        _times(parameters), margins, safe,
+        *as_arrays(parameters), safe,
     )  # fmt: skip
     return safe
 
 
 @compiled("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[::1], b1[::1])")
-def _are_safe(
+def mark_safe(
     commands: Array,
     sent: Array,
     held: Array,
@@ -185,6 +187,7 @@ def _are_safe(
     margins: Array,
     safe: NDArray[np.bool_],
 ) -> None:
+    """Writes which commands are safe; see `are_safe`, and `as_arrays` for times and margins."""
     margin, contact = margins[0], margins[1]
     paths = _stopping_paths(commands, sent, held, times)
     reach = 0.0

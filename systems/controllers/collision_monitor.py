@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
-from systems.controllers.braking import CollisionMonitorParameters, are_safe
+from systems.compiled import compiled, packed
+from systems.controllers.braking import CollisionMonitorParameters, as_arrays, mark_safe
 from systems.health import Counts
 from systems.messages import Scan
-from systems.pose_trail import empty_trail, ray_poses, remember
-from systems.scans import SCAN_FAULTS, scan_fault
+from systems.pose_trail import empty_trail, ray_ends, ray_poses, remember
+from systems.scans import SCAN_FAULTS, hits, scan_fault
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -35,10 +36,13 @@ _BEYOND = 0.02  # m; a ray that ends this far behind a point has passed it
 
 def move(pose: Array, twist: Array, dt: float) -> Array:
     """Returns the pose (3,) after driving with the twist [v, omega] along an arc for dt."""
-    half = twist[1] * dt / 2
-    chord = twist[0] * dt * np.sinc(half / np.pi)
-    step = [chord * math.cos(pose[2] + half), chord * math.sin(pose[2] + half), 2 * half]
-    return pose + np.array(step)
+    v, omega = float(twist[0]), float(twist[1])
+    x, y, theta = pose.tolist()
+    half = omega * dt / 2
+    chord = v * dt * (math.sin(half) / half if half else 1.0)
+    return np.array(
+        (x + chord * math.cos(theta + half), y + chord * math.sin(theta + half), theta + 2 * half)
+    )
 
 
 def into_body(points: Array, pose: Array) -> Array:
@@ -61,41 +65,54 @@ def safe_command(
     The command itself; else the fastest along the same arc that is safe; else its turn alone, in
     place, at up to its rate; else nothing. Arguments as in `are_safe`.
     """
-
-    def are_fine(choices: Array) -> NDArray[np.bool_]:
-        return are_safe(choices, sent, held, points, hull, parameters)
-
-    if not command.any() or are_fine(command[None])[0]:
+    if not command.any():
         return command, 1.0
+    allowed = np.array(command)
+    scale = _safe_command(
+        allowed, packed(sent), packed(held), packed(points), packed(hull),
+        *as_arrays(parameters),
+    )  # fmt: skip
+    return allowed, scale
+
+
+@compiled("f8(f8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8[::1])")
+def _safe_command(
+    command: Array,
+    sent: Array,
+    held: Array,
+    points: Array,
+    hull: Array,
+    times: Array,
+    margins: Array,
+) -> float:
+    """Reduces the command to what is safe; returns by which factor its speed is scaled."""
+    one, safe = command.copy().reshape(1, 2), np.empty(3, np.bool_)
+    mark_safe(one, sent, held, points, hull, times, margins, safe)
+    if safe[0]:
+        return 1.0
     first, last = 0, len(_SLOWER)
     while first < last:  # the slower, the safer
         middle = (first + last) // 2
-        if are_fine(_SLOWER[middle] * command[None])[0]:
+        one[0] = _SLOWER[middle] * command
+        mark_safe(one, sent, held, points, hull, times, margins, safe)
+        if safe[0]:
             last = middle
         else:
             first = middle + 1
     if last < len(_SLOWER):
-        return _SLOWER[last] * command, float(_SLOWER[last])
-    if command[0] != 0 and command[1] != 0:
-        turns = _TURNS[:, None] * np.array([0.0, command[1]])
-        fine = are_fine(turns)
-        if fine.any():
-            return turns[np.argmax(fine)], 0.0
-    return np.zeros(2), 0.0
-
-
-def hits(scan: Scan, rays: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Returns which rays hit something (n,), and where: (k, 2) m, in the frame of the rays.
-
-    Args:
-        scan: n rays.
-        rays: (n, 3), see `systems.pose_trail.ray_poses`.
-    """
-    hit = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
-    hit &= np.isfinite(scan.ranges)
-    x, y, direction = rays[hit].T
-    along = scan.ranges[hit]
-    return hit, np.stack([x + along * np.cos(direction), y + along * np.sin(direction)], axis=-1)
+        command *= _SLOWER[last]
+        return float(_SLOWER[last])
+    turning = command[0] != 0 and command[1] != 0
+    turns = np.zeros((3, 2))
+    turns[:, 1] = _TURNS * command[1]
+    command[:] = 0.0
+    if turning:
+        mark_safe(turns, sent, held, points, hull, times, margins, safe)
+        for k in range(3):
+            if safe[k]:
+                command[1] = turns[k, 1]
+                break
+    return 0.0
 
 
 def still_hidden(remembered: Array, scan: Scan, rays: Array) -> Array:
@@ -109,10 +126,12 @@ def still_hidden(remembered: Array, scan: Scan, rays: Array) -> Array:
         scan: a scan made since.
         rays: its rays, in the frame of the points.
     """
+    if len(remembered) == 0:
+        return remembered
     seen_from = rays[:: max(len(rays) // 10, 1), :2]
     distance = np.linalg.norm(remembered[:, None] - seen_from, axis=-1)
     remembered = remembered[distance.min(axis=1) < scan.range_min]
-    hit = hits(scan, rays)[0]
+    hit = hits(scan)
     offset = remembered[:, None] - rays[hit, :2]
     c, s = np.cos(rays[hit, 2]), np.sin(rays[hit, 2])
     along = offset[..., 0] * c + offset[..., 1] * s
@@ -120,6 +139,11 @@ def still_hidden(remembered: Array, scan: Scan, rays: Array) -> Array:
     passed = (along > 0) & (along < scan.ranges[hit] - _BEYOND)
     passed &= aside < 0.001 + along * abs(scan.angle_increment) / 2
     return remembered[~passed.any(axis=1)]
+
+
+def _filled(near: Array) -> Array:
+    """Returns the points that are there, of an array filled up with NaN."""
+    return near[np.isfinite(near[:, 0])]
 
 
 class CollisionMonitor(LeafSystem):
@@ -221,38 +245,38 @@ class CollisionMonitor(LeafSystem):
         now = context.get_time()
         command, scan = self._command_input.Eval(context), self._scan_input.Eval(context)
         sent = self._sent_input.Eval(context)
-        _, last_stamp, *last_sent = context.get_discrete_state(self._memory).get_value()
+        memory = context.get_discrete_state(self._memory).get_value()
+        last_stamp, last_sent = memory[1], memory[2:]
         held = context.get_discrete_state(self._held).get_value()
-        bad_sent = not np.isfinite(sent).all()
+        bad_sent = not all(map(math.isfinite, sent.tolist()))
         if bad_sent:
-            sent = np.array(last_sent)
+            sent = last_sent
         # Dead reckoning in a frame of its own, from where it was switched on.
         trail = context.get_discrete_state(self._trail).get_value().reshape(-1, 4)
         pose = np.zeros(3)
         if not math.isnan(trail[-1, 0]):
-            pose = move(trail[-1, 1:], (np.array(last_sent) + sent) / 2, now - trail[-1, 0])
+            pose = move(trail[-1, 1:], (last_sent + sent) / 2, now - float(trail[-1, 0]))
         trail = remember(trail, now, pose)
 
         fault = scan_fault(scan, now, self._parameters.max_scan_age)
-        if fault is None and not scan.range_max > scan.range_min:
-            fault = "garbled_scan"
-        bad_command = not np.isfinite(command).all()
+        bad_command = not all(map(math.isfinite, command.tolist()))
         allowed, scale = np.zeros(2), 0.0
         if fault is None:
             rays = ray_poses(scan, self._lidar_pose, trail)
-            points = hits(scan, rays)[1]
+            points = ray_ends(scan, rays)
             near = context.get_discrete_state(self._near).get_value().reshape(-1, 2)
             if scan.stamp != last_stamp:
                 near = self._remember_near(near, points, scan, rays, pose)
                 discrete_state.set_value(self._near, near.ravel())
-            points = np.concatenate([points, near[np.isfinite(near[:, 0])]])
+            if not math.isnan(near[0, 0]):
+                points = np.concatenate([points, _filled(near)])
             if not bad_command and not bad_sent:
                 allowed, scale = safe_command(
                     command, sent, held, into_body(points, pose), self._hull, self._parameters
                 )
             last_stamp = scan.stamp
         discrete_state.set_value(self._held, allowed)
-        discrete_state.set_value(self._memory, [scale, last_stamp, *sent])
+        discrete_state.set_value(self._memory, [scale, last_stamp, *sent.tolist()])
         discrete_state.set_value(self._trail, trail.ravel())
         counts = {fault: 1} if fault else {}
         if bad_command or bad_sent:
@@ -265,13 +289,13 @@ class CollisionMonitor(LeafSystem):
         self, near: Array, points: Array, scan: Scan, rays: Array, pose: Array
     ) -> Array:
         """Returns the points that the next scan may be blind to: (_REMEMBERED, 2), NaN-filled."""
-        kept = still_hidden(near[np.isfinite(near[:, 0])], scan, rays)
+        kept = still_hidden(_filled(near), scan, rays)
         c, s = math.cos(pose[2]), math.sin(pose[2])
         lidar = pose[:2] + np.array([[c, -s], [s, c]]) @ self._lidar_pose[:2]
-        distance = np.hypot(*(points - lidar).T)
-        order = np.argsort(distance)
-        fresh = points[order[distance[order] < scan.range_min + _NEAR]]
-        found = np.concatenate([kept, fresh])[:_REMEMBERED]
+        distance = np.hypot(points[:, 0] - lidar[0], points[:, 1] - lidar[1])
+        fresh = np.flatnonzero(distance < scan.range_min + _NEAR)
+        fresh = fresh[np.argsort(distance[fresh])]
+        found = np.concatenate([kept, points[fresh]])[:_REMEMBERED]
         filled = np.full((_REMEMBERED, 2), math.nan)
         filled[: len(found)] = found
         return filled
