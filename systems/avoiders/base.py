@@ -17,7 +17,6 @@ from systems.angles import wrap
 from systems.avoiders.surroundings import (
     REMEMBERED,
     extend,
-    in_frame,
     step_between,
     surroundings,
 )
@@ -103,13 +102,16 @@ class View:
     @property
     def bearing(self) -> float:
         """Where the goal is seen from the body, rad; 0 on the goal."""
-        ahead, aside = in_frame(self.pose, self.goal[None])[0]
-        return math.atan2(aside, ahead)
+        x, y, theta = self.pose.tolist()
+        c, s = math.cos(theta), math.sin(theta)
+        dx, dy = float(self.goal[0]) - x, float(self.goal[1]) - y
+        return math.atan2(c * dy - s * dx, c * dx + s * dy)
 
     def ahead(self, bearing: float, distance: float) -> Array:
         """Returns the point (2,) in map that lies in this direction of the body."""
-        angle = self.pose[2] + bearing
-        return self.pose[:2] + distance * np.array([math.cos(angle), math.sin(angle)])
+        x, y, theta = self.pose.tolist()
+        angle = theta + bearing
+        return np.array((x + distance * math.cos(angle), y + distance * math.sin(angle)))
 
 
 @dataclass(frozen=True)
@@ -287,7 +289,7 @@ class Avoider(LeafSystem):
         scan = self._scan_input.Eval(context)
         twist = self._command_input.Eval(context)
         fault = scan_fault(scan, now, self._limits.max_scan_age)
-        sound = [bool(np.isfinite(value).all()) for value in (pose, goal, twist)]
+        sound = [all(map(math.isfinite, value.tolist())) for value in (pose, goal, twist)]
         self._counts.add(
             context,
             discrete_state,
@@ -316,7 +318,7 @@ class Avoider(LeafSystem):
         if choice.bearing is None:
             before = _Patience(*context.get_discrete_state(self._patience).get_value())
             patience = before.after(view, turn, self._dt)
-        discrete_state.set_value(self._patience, list(vars(patience).values()))
+        discrete_state.set_value(self._patience, [patience.side, patience.turned, patience.time])
         self._act(discrete_state, view, choice, patience, scan.stamp)
 
     def _follow(
@@ -330,13 +332,14 @@ class Avoider(LeafSystem):
         """Adds to the trail; returns by how much the robot turned since the last time, and it."""
         trail = context.get_discrete_state(self._trail).get_value().reshape(-1, 4)
         last = context.get_discrete_state(self._last).get_value()
-        dt = now - trail[-1, 0]
+        dt = now - float(trail[-1, 0])
         step = np.zeros(3)
         if math.isfinite(dt):
             step = step_between(last, pose, twist, dt)
         trail = extend(trail, now, step)
         discrete_state.set_value(self._trail, trail.ravel())
-        discrete_state.set_value(self._last, pose if np.isfinite(pose).all() else last)
+        if all(map(math.isfinite, pose.tolist())):
+            discrete_state.set_value(self._last, pose)
         return float(step[2]), trail
 
     def _act(
@@ -375,31 +378,31 @@ class Avoider(LeafSystem):
         *,
         anchored: bool,
     ) -> None:
-        verdict = [STATUSES.index(status), stamp, direction, float(anchored), *goal]
-        discrete_state.set_value(self._verdict, np.array(verdict))
+        verdict = [STATUSES.index(status), stamp, direction, float(anchored), *goal.tolist()]
+        discrete_state.set_value(self._verdict, verdict)
 
     def _calc_goal(self, context: Context, output: Any) -> None:
-        *_, anchored, x, y = context.get_discrete_state(self._verdict).get_value()
-        goal = np.array([x, y])
+        *_, anchored, x, y = context.get_discrete_state(self._verdict).get_value().tolist()
         if anchored:
-            pose = self._pose_input.Eval(context)
-            if not np.isfinite(pose).all():
-                pose = context.get_discrete_state(self._last).get_value()
-            goal += pose[:2]
-        output.SetFromVector(goal)
+            pose = self._pose_input.Eval(context).tolist()
+            if not all(map(math.isfinite, pose)):
+                pose = context.get_discrete_state(self._last).get_value().tolist()
+            x, y = x + pose[0], y + pose[1]
+        output.SetFromVector((x, y))
 
     def _calc_state(self, context: Context, output: Any) -> None:
-        status, stamp, direction, *_ = context.get_discrete_state(self._verdict).get_value()
+        verdict = context.get_discrete_state(self._verdict).get_value()
+        status, stamp, direction = verdict[:3].tolist()
         sectors = context.get_discrete_state(self._sectors).get_value().reshape(3, -1)
         seen = status != STATUSES.index("blind")
         angles, density, free = sectors if seen else np.zeros((3, 0))
         output.set_value(
             AvoiderState(
-                stamp=float(stamp),
+                stamp=stamp,
                 status=STATUSES[int(status)],
                 angles=angles.copy(),
                 density=density.copy(),
                 free=free > 0.5,
-                direction=float(direction),
+                direction=direction,
             )
         )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from systems.angles import wrap
 from systems.messages import Scan
-from systems.pose_trail import ray_poses, remember
+from systems.pose_trail import ray_ends, ray_poses, remember
 
 Array = NDArray[np.float64]
 
@@ -51,8 +51,11 @@ def step_between(last: Array, pose: Array, twist: Array, dt: float) -> Array:
         twist: (2,) [v (m/s), omega (rad/s)] as sent to the wheels.
         dt: s.
     """
-    forward, aside = in_frame(last, pose[None, :2])[0]
-    turn = wrap(float(pose[2] - last[2]))
+    x, y, theta = last.tolist()
+    c, s = math.cos(theta), math.sin(theta)
+    dx, dy = float(pose[0]) - x, float(pose[1]) - y
+    forward, aside = c * dx + s * dy, c * dy - s * dx
+    turn = wrap(float(pose[2]) - theta)
     v, omega = float(twist[0]), float(twist[1])
     moved = (
         math.hypot(forward - v * dt, aside) <= _SPEED_SLACK * dt
@@ -60,17 +63,19 @@ def step_between(last: Array, pose: Array, twist: Array, dt: float) -> Array:
     )
     if not moved:
         half = omega * dt / 2
-        chord = v * dt * float(np.sinc(half / math.pi))
-        return np.array([chord * math.cos(half), chord * math.sin(half), 2 * half])
-    return np.array([forward, aside, turn])
+        chord = v * dt * (math.sin(half) / half if half else 1.0)
+        forward, aside, turn = chord * math.cos(half), chord * math.sin(half), 2 * half
+    return np.array((forward, aside, turn))
 
 
 def extend(trail: Array, now: float, step: Array) -> Array:
     """Returns the trail (see `systems.pose_trail`) with the pose after one more step (3,)."""
-    last = trail[-1, 1:] if np.isfinite(trail[-1]).all() else np.zeros(3)
-    return remember(
-        trail, now, np.array([*out_of_frame(last, step[None, :2])[0], last[2] + step[2]])
-    )
+    last = trail[-1].tolist()
+    x, y, theta = last[1:] if all(map(math.isfinite, last)) else (0.0, 0.0, 0.0)
+    c, s = math.cos(theta), math.sin(theta)
+    forward, aside, turn = step.tolist()
+    pose = (x + c * forward - s * aside, y + s * forward + c * aside, theta + turn)
+    return remember(trail, now, np.array(pose))
 
 
 def surroundings(
@@ -88,18 +93,16 @@ def surroundings(
         Points (k, 2) in the body's frame now, and the next `remembered`.
     """
     rays = ray_poses(scan, lidar_pose, trail)
-    hit = (scan.ranges >= scan.range_min) & (scan.ranges <= scan.range_max)
-    hit &= np.isfinite(scan.ranges)
-    x, y, direction = rays[hit].T
-    ranges = scan.ranges[hit]
-    points = np.stack([x + ranges * np.cos(direction), y + ranges * np.sin(direction)], axis=-1)
-    kept = remembered[~np.isnan(remembered[:, 0])]
-    kept = kept[_out_of_sight(scan, rays, kept)] if len(kept) else kept
+    points = ray_ends(scan, rays)
     here = trail[-1, 1:]
-    lidar = out_of_frame(here, lidar_pose[None, :2])[0]
-    near = np.hypot(*(points - lidar).T) <= scan.range_min + _RIM
-    memory = _nearest_in_each_direction(np.concatenate([kept, points[near]]), lidar)
-    return in_frame(here, np.concatenate([points, kept])), memory
+    x, y = out_of_frame(here, lidar_pose[None, :2])[0]
+    memory = points[np.hypot(points[:, 0] - x, points[:, 1] - y) <= scan.range_min + _RIM]
+    if not np.isnan(remembered).all():
+        kept = remembered[~np.isnan(remembered[:, 0])]
+        kept = kept[_out_of_sight(scan, rays, kept)]
+        memory = np.concatenate([kept, memory])
+        points = np.concatenate([points, kept])
+    return in_frame(here, points), _nearest_in_each_direction(memory, np.array((x, y)))
 
 
 def _out_of_sight(scan: Scan, rays: Array, points: Array) -> NDArray[np.bool_]:
@@ -121,6 +124,8 @@ def _out_of_sight(scan: Scan, rays: Array, points: Array) -> NDArray[np.bool_]:
 def _nearest_in_each_direction(points: Array, centre: Array) -> Array:
     """Returns (REMEMBERED, 2): of each direction from `centre` the nearest point, NaN if none."""
     result = np.full((REMEMBERED, 2), math.nan)
+    if len(points) == 0:
+        return result
     offset = points - centre
     order = np.argsort(-np.hypot(offset[:, 0], offset[:, 1]))
     angle = np.arctan2(offset[order, 1], offset[order, 0]) / (2 * math.pi)

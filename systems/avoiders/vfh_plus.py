@@ -15,6 +15,13 @@ from numpy.typing import NDArray
 
 from systems.angles import wrap
 from systems.avoiders.base import Avoider, AvoiderParameters, Choice, Hull, View
+from systems.avoiders.polar_histogram import (
+    binary_histogram,
+    free_distance,
+    primary_histogram,
+    sector_middles,
+    turning_limits,
+)
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -26,7 +33,8 @@ _TOUCHING = 0.95
 # What the disc that is moved ahead of the robot is smaller than that of the histogram, m: a
 # direction may be off by half a sector from one that is free.
 _SLACK = 0.02
-_AHEAD_SAMPLES = 12
+# Of the turn to the chosen direction, where it is looked how far that disc gets.
+_TOWARD = np.linspace(0.0, 1.0, 12)
 
 
 @dataclass
@@ -97,72 +105,6 @@ class VfhPlusParameters(AvoiderParameters):
         )
 
 
-def sector_middles(sectors: int) -> Array:
-    """Returns the directions of the sectors in map, (sectors,) rad; the first is 0."""
-    return np.asarray(wrap(np.arange(sectors) * (2 * math.pi / sectors)))
-
-
-def half_angles(distances: Array, radius: float) -> Array:
-    """Returns by how much points are widened to either side for a robot of this radius, rad.
-
-    asin(radius / distance) as in [VFH+]; a quarter turn for what is nearer than the radius.
-    """
-    # 1e-9 for a point at the origin, which has no direction.
-    return np.arcsin(np.minimum(radius / np.maximum(distances, 1e-9), 1.0))
-
-
-def primary_histogram(points: Array, radius: float, parameters: VfhPlusParameters) -> Array:
-    """Returns how full each sector is: (sectors,), points weighted by their nearness.
-
-    Args:
-        points: (k, 2) m about the robot's origin, with the axes of map.
-        radius: by which they are widened, m.
-        parameters: window and number of sectors.
-    """
-    n = parameters.sectors
-    width = 2 * math.pi / n
-    distances = np.hypot(points[:, 0], points[:, 1])
-    near = distances < parameters.window
-    distances = distances[near]
-    weights = 1 - (distances / parameters.window) ** 2
-    bearings = np.arctan2(points[near, 1], points[near, 0])
-    half = half_angles(distances, radius)
-    middle = np.floor(bearings / width + 0.5).astype(int)
-    # Sectors whose middle is within the widened point, and the point's own. They may reach beyond
-    # the ends of the circle: it is laid out three times, and folded.
-    first = np.minimum(np.ceil((bearings - half) / width - 1e-9).astype(int), middle) + n
-    last = np.maximum(np.floor((bearings + half) / width + 1e-9).astype(int), middle) + n
-    steps = np.bincount(first, weights, 3 * n) - np.bincount(last + 1, weights, 3 * n)
-    density: Array = np.cumsum(steps).reshape(3, n).sum(axis=0)
-    return np.maximum(density, 0.0)
-
-
-def binary_histogram(density: Array, blocked: Mask, low: float, high: float) -> Mask:
-    """Returns which sectors are blocked: above `high`, or blocked before and not below `low`."""
-    return (density > high) | (blocked & (density >= low))
-
-
-def turning_limits(points: Array, radius: float, turning_radius: float) -> tuple[float, float]:
-    """Returns how far to the right (<= 0) and to the left the robot can turn at speed, rad.
-
-    A point within `radius` of the circle that the robot turns on blocks what lies beyond it on that
-    side ([VFH+], masked polar histogram).
-
-    Args:
-        points: (k, 2) m, in the body's frame.
-        radius: of the widened robot, m.
-        turning_radius: m.
-    """
-    x, y = points[:, 0], points[:, 1]
-    bearings = np.arctan2(y, x)
-    reach = turning_radius + radius
-    on_left = (bearings >= 0) & (np.hypot(x, y - turning_radius) < reach)
-    on_right = (bearings <= 0) & (np.hypot(x, y + turning_radius) < reach)
-    left = float(np.min(bearings[on_left], initial=math.pi))
-    right = float(np.max(bearings[on_right], initial=-math.pi))
-    return right, left
-
-
 def candidate_directions(free: Mask, target: float, wide: float) -> list[float]:
     """Returns the directions worth choosing from, rad.
 
@@ -180,14 +122,19 @@ def candidate_directions(free: Mask, target: float, wide: float) -> list[float]:
     if free.all():
         return [target]
     candidates: list[float] = []
-    for first in np.flatnonzero(free & ~np.roll(free, 1)):
-        length = int(np.argmin(np.roll(free, -first)))
-        right, left = float(first) * width, float(first + length - 1) * width
+    is_free = free.tolist()
+    for first in range(n):
+        if not is_free[first] or is_free[first - 1]:
+            continue
+        length = 1
+        while is_free[(first + length) % n]:
+            length += 1
+        right, left = first * width, (first + length - 1) * width
         if length * width < wide:
             candidates.append((right + left) / 2)
         else:  # half a sector: an opening ends at its sectors' edges
             candidates += [right + (wide - width) / 2, left - (wide - width) / 2]
-    if free[math.floor(target / width + 0.5) % n]:
+    if is_free[math.floor(target / width + 0.5) % n]:
         candidates.append(target)
     return [wrap(candidate) for candidate in candidates]
 
@@ -208,34 +155,16 @@ def cheapest(
         previous: direction chosen last, rad; NaN when there is none.
         parameters: costs.
     """
-    angles = np.array(candidates)
-    cost = parameters.target_cost * np.abs(wrap(angles - target))
-    cost += parameters.current_cost * np.abs(wrap(angles - heading))
-    if not math.isnan(previous):
-        cost += parameters.previous_cost * np.abs(wrap(angles - previous))
-    cost -= 1e-9 * (wrap(angles - target) > 0)
-    return float(angles[np.argmin(cost)])
+    p = parameters
 
+    def cost(angle: float) -> float:
+        off = wrap(angle - target)
+        total = p.target_cost * abs(off) + p.current_cost * abs(wrap(angle - heading))
+        if not math.isnan(previous):
+            total += p.previous_cost * abs(wrap(angle - previous))
+        return float(total - 1e-9 * (off > 0))
 
-def free_distance(points: Array, bearings: Array, radius: float) -> Array:
-    """Returns how far a disc about the robot's origin gets in each direction, m.
-
-    Args:
-        points: (k, 2) m, in the frame of the bearings.
-        bearings: (m,) rad.
-        radius: of the disc, m. Of a point within it, only coming nearer counts.
-
-    Returns:
-        (m,) inf where nothing is in the way.
-    """
-    c, s = np.cos(bearings)[:, None], np.sin(bearings)[:, None]
-    along = c * points[:, 0] + s * points[:, 1]
-    aside = c * points[:, 1] - s * points[:, 0]
-    half = np.sqrt(np.maximum(radius**2 - aside**2, 0.0))
-    hit = (along > 0) & (np.abs(aside) < radius)
-    distances = np.where(hit, np.maximum(along - half, 0.0), math.inf)
-    result: Array = distances.min(axis=1, initial=math.inf)
-    return result
+    return min(candidates, key=cost)
 
 
 def choose(view: View, memory: Array, parameters: VfhPlusParameters, hull: Hull) -> Choice:
@@ -255,7 +184,8 @@ def choose(view: View, memory: Array, parameters: VfhPlusParameters, hull: Hull)
     points = view.points[near]
     radius = widened_radius(away[near], hull, p.safety_distance)
     c, s = math.cos(heading), math.sin(heading)
-    density = primary_histogram(points @ np.array([[c, s], [-s, c]]), radius, p)
+    in_map = points @ np.array(((c, s), (-s, c)))
+    density = primary_histogram(in_map, radius, window=p.window, sectors=p.sectors)
     blocked = binary_histogram(density, memory[:-1] > 0.5, p.threshold_low, p.threshold_high)
     bearings = wrap(sector_middles(p.sectors) - heading)
     free = ~blocked
@@ -275,7 +205,7 @@ def choose(view: View, memory: Array, parameters: VfhPlusParameters, hull: Hull)
     bearing = wrap(direction - heading)
     ahead = free_distance(
         points,
-        np.linspace(0.0, bearing, _AHEAD_SAMPLES),
+        bearing * _TOWARD,
         max(radius - _SLACK, hull.half_width),
     )
     room = float(ahead.min())

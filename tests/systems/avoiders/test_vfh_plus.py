@@ -8,19 +8,22 @@ import pytest
 
 from systems.angles import wrap
 from systems.avoiders.base import Hull, View
-from systems.avoiders.vfh_plus import (
-    VfhPlusParameters,
+from systems.avoiders.polar_histogram import (
     binary_histogram,
-    candidate_directions,
-    cheapest,
-    choose,
     free_distance,
     primary_histogram,
     turning_limits,
+)
+from systems.avoiders.vfh_plus import (
+    VfhPlusParameters,
+    candidate_directions,
+    cheapest,
+    choose,
     widened_radius,
 )
 
 P = VfhPlusParameters()
+ROUND: dict[str, Any] = {"window": P.window, "sectors": P.sectors}
 HULL = Hull(0.11, 0.11, 0.0975)
 FRESH = np.append(np.zeros(72), math.nan)
 
@@ -53,13 +56,13 @@ def degrees_where(mask: np.ndarray) -> set[int]:
 
 def test_a_point_fills_the_sectors_that_the_robot_would_meet_it_in() -> None:
     # asin(0.25 / 1) = 14.5 degrees to either side; it counts 1 - (1 / 1.5)^2.
-    density = primary_histogram(polar((1.0, 0)), 0.25, P)
+    density = primary_histogram(polar((1.0, 0)), 0.25, **ROUND)
     assert degrees_where(density > 0) == {-10, -5, 0, 5, 10}
     np.testing.assert_allclose(density[[0, 1, 2, 70, 71]], 1 - 1 / 2.25)
 
 
 def test_points_add_up_and_go_around_the_back() -> None:
-    density = primary_histogram(polar((1.0, 175), (0.5, -170)), 0.25, P)
+    density = primary_histogram(polar((1.0, 175), (0.5, -170)), 0.25, **ROUND)
     # The first from 160.5 to 189.5 degrees, the second (30 degrees) from 160 to 220.
     assert degrees_where(density > 0) == {*range(160, 181, 5), *range(-175, -139, 5)}
     far, near = 1 - 1 / 2.25, 1 - 0.25 / 2.25
@@ -69,12 +72,12 @@ def test_points_add_up_and_go_around_the_back() -> None:
 
 
 def test_a_point_nearer_than_the_radius_fills_half_the_circle() -> None:
-    density = primary_histogram(polar((0.2, 90)), 0.25, P)
+    density = primary_histogram(polar((0.2, 90)), 0.25, **ROUND)
     assert degrees_where(density > 0) == set(range(0, 181, 5))
 
 
 def test_what_is_beyond_the_window_does_not_count() -> None:
-    assert not primary_histogram(polar((1.51, 0)), 0.25, P).any()
+    assert not primary_histogram(polar((1.51, 0)), 0.25, **ROUND).any()
 
 
 def test_between_the_thresholds_a_sector_stays_as_it_was() -> None:
