@@ -1,8 +1,6 @@
-"""The shortest way on an occupancy grid that keeps its distance: A*.
+"""The shortest way on an occupancy grid that keeps its distance.
 
-Hart, Nilsson, Raphael, "A formal basis for the heuristic determination of minimum cost paths", IEEE
-Transactions on Systems Science and Cybernetics 4, 1968. Here on an 8-connected grid with the octile
-distance as heuristic, and then pulled straight where that costs no more.
+The cheapest way on the cells (A*, see `grid_search`), pulled straight where that costs no more.
 """
 
 from __future__ import annotations
@@ -10,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from heapq import heappop, heappush
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,8 +18,6 @@ from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSyste
 from systems.health import Counts
 from systems.messages import OccupancyGrid, Path
 from systems.planners.cost_map import (
-    STEPS,
-    Cell,
     CostMap,
     cost_map,
     driving_cost,
@@ -32,14 +27,11 @@ from systems.planners.cost_map import (
     steering_point,
     way_out,
 )
+from systems.planners.grid_search import shortest_way
 from systems.planners.polyline import rest_of
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
-
-_DIAGONAL = math.sqrt(2.0)
-# Breaks ties between equally long ways; the way found is longer than the best by no more than this.
-_GREED = 1.001
 
 
 @dataclass
@@ -90,78 +82,6 @@ class AStarParameters:
             patience=self.patience,
         )
         require(0 <= self.improvement < 1, "improvement", self.improvement, "0 or more, below 1")
-
-
-def shortest_way(cost: Array, start: Cell, goal: Cell) -> list[Cell] | None:
-    """Returns the cells of the cheapest way on an 8-connected grid, or None.
-
-    A step costs its length in cells times the mean cost of its two cells. No step cuts a corner
-    between two cells of which one cannot be entered. The way is at most 0.1 % costlier than the
-    cheapest.
-
-    Args:
-        cost: (rows, columns) at least 1; inf where there is no way.
-        start: (row, column).
-        goal: (row, column).
-    """
-    if not (np.isfinite(cost[start]) and np.isfinite(cost[goal])):
-        return None
-    rows, columns = cost.shape[0], cost.shape[1] + 2
-    padded = np.pad(cost, 1, constant_values=np.inf)
-    free = np.isfinite(padded)
-    # Which of the eight steps are open, as bits: of what a loop would ask at each cell.
-    inner = slice(1, rows + 1), slice(1, columns - 1)
-    steps = np.zeros(padded.shape, np.uint8)
-
-    def ahead(dy: int, dx: int) -> NDArray[np.bool_]:
-        found: NDArray[np.bool_] = free[1 + dy : rows + 1 + dy, 1 + dx : columns - 1 + dx]
-        return found
-
-    for k, (dy, dx) in enumerate(STEPS):
-        is_open = ahead(dy, dx) & ahead(dy, 0) & ahead(0, dx)
-        steps[inner] |= is_open.astype(np.uint8) << k
-    moves = _moves(columns)
-    goal_row, goal_column = goal[0] + 1, goal[1] + 1
-    y = np.abs(np.arange(rows + 2) - goal_row)[:, None]
-    x = np.abs(np.arange(columns) - goal_column)
-    octile = (np.maximum(x, y) + (_DIAGONAL - 1) * np.minimum(x, y)) * _GREED
-
-    half: list[float] = (padded / 2).ravel().tolist()
-    to_go: list[float] = octile.ravel().tolist()
-    open_steps: list[int] = steps.ravel().tolist()
-    spent = [math.inf] * len(half)
-    parent = [-1] * len(half)
-    closed = bytearray(len(half))
-    first, last = (start[0] + 1) * columns + start[1] + 1, goal_row * columns + goal_column
-    spent[first] = 0.0
-    heap = [(to_go[first], first)]
-    while heap:
-        _, here = heappop(heap)
-        if here == last:
-            break
-        if closed[here]:
-            continue
-        closed[here] = 1
-        so_far, half_cost = spent[here], half[here]
-        for offset, length in moves[open_steps[here]]:
-            there = here + offset
-            total = so_far + length * (half_cost + half[there])
-            if total < spent[there]:
-                spent[there] = total
-                parent[there] = here
-                heappush(heap, (total + to_go[there], there))
-    if parent[last] < 0 and last != first:
-        return None
-    way = [last]
-    while way[-1] != first:
-        way.append(parent[way[-1]])
-    return [(index // columns - 1, index % columns - 1) for index in reversed(way)]
-
-
-def _moves(columns: int) -> list[list[tuple[int, float]]]:
-    """Returns for each set of open steps, as bits, their (offset, length) on a flat grid."""
-    every = [(dy * columns + dx, math.hypot(dy, dx)) for dy, dx in STEPS]
-    return [[every[k] for k in range(8) if bits >> k & 1] for bits in range(256)]
 
 
 def pulled_straight(costs: CostMap, points: Array) -> Array:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from heapq import heappop, heappush
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.compiled import compiled
+from systems.compiled import compiled, packed
 from systems.messages import OccupancyGrid
 from systems.planners.polyline import length_of, points_along
 
@@ -30,19 +31,50 @@ _MOST_CELLS = 4_000_000
 class CostMap:
     """What it costs to drive where, made of an occupancy grid.
 
+    Cost and clearance of all cells are worked out when they are first asked for: whether a path is
+    still free can be told without.
+
     Attributes:
         resolution: side of a cell, m.
         origin: (2,) corner of cell (0, 0) with the least coordinates, m.
-        cost: (rows along y, columns along x) cost of a metre, at least 1; inf where the robot would
-            touch something.
-        clearance: (rows, columns) from the middle of the cell to what is occupied, m; 0 or less in
-            it.
+        log_odds: (rows along y, columns along x) float32; 0 is unknown.
+        occupied_above: log-odds above which a cell is occupied.
+        radius: of the circle that holds the robot, m.
+        soft_margin: beyond the radius, a metre costs more up to this distance, m.
+        soft_cost: how much more at the radius; falls with the square to 0 at soft_margin.
+        unknown_cost: how much more where nothing has been seen.
     """
 
     resolution: float
     origin: Array
-    cost: Array
-    clearance: Array
+    log_odds: NDArray[np.float32]
+    occupied_above: float
+    radius: float
+    soft_margin: float
+    soft_cost: float
+    unknown_cost: float
+
+    @cached_property
+    def clearance(self) -> Array:
+        """From the middle of each cell to what is occupied, m; 0 or less in it."""
+        occupied = self.log_odds > self.occupied_above
+        if not occupied.any():
+            return np.full(occupied.shape, np.inf)
+        distance = cv2.distanceTransform(
+            (~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
+        )
+        return (distance - 0.5).astype(float) * self.resolution
+
+    @cached_property
+    def cost(self) -> Array:
+        """Of a metre in each cell, at least 1; inf where the robot would touch something."""
+        cost = np.empty(self.log_odds.shape)
+        margin = max(self.soft_margin, 1e-9)
+        _costs(
+            self.log_odds, self.clearance, self.radius, margin, self.soft_cost, self.unknown_cost,
+            cost,
+        )  # fmt: skip
+        return cost
 
     def cell(self, point: Array) -> Cell:
         """Returns the cell (row, column) of a point (2,) m; it may lie outside."""
@@ -93,27 +125,29 @@ def cost_map(
         ValueError: the map would be larger than allowed.
     """
     resolution = grid.resolution
-    shape = np.array(grid.log_odds.shape)
-    corners = np.array([(point - grid.origin) / resolution for point in points]).reshape(-1, 2)
-    low = np.floor(np.vstack([corners, [0, 0]]).min(axis=0))[::-1]
-    high = np.ceil(np.vstack([corners, shape[::-1]]).max(axis=0))[::-1]
-    sides = high - low + 2 * _RIM / resolution
-    if sides.max() * resolution > max_side or sides.prod() > _MOST_CELLS:
+    rows, columns = grid.log_odds.shape
+    x, y = grid.origin.tolist()
+    across = [0.0, float(columns), *((float(point[0]) - x) / resolution for point in points)]
+    along = [0.0, float(rows), *((float(point[1]) - y) / resolution for point in points)]
+    sides = [-(-max(s) // 1) - min(s) // 1 + 2 * _RIM / resolution for s in (across, along)]
+    fits = all(side * resolution <= max_side for side in sides)  # none is NaN either
+    if not fits or sides[0] * sides[1] > _MOST_CELLS:
         raise ValueError(f"the map would be longer than {max_side} m")
     rim = math.ceil(_RIM / resolution)
-    before, after = rim - low.astype(int), rim + high.astype(int) - shape
-    log_odds = np.pad(grid.log_odds, np.stack([before, after], axis=-1))
-    occupied = log_odds > occupied_above
-    if occupied.any():
-        distance = cv2.distanceTransform(
-            (~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE
-        )
-        clearance = (distance - 0.5).astype(float) * resolution
-    else:
-        clearance = np.full(log_odds.shape, np.inf)
-    cost = np.empty(log_odds.shape)
-    _costs(log_odds, clearance, radius, max(soft_margin, 1e-9), soft_cost, unknown_cost, cost)
-    return CostMap(resolution, grid.origin - before[::-1] * resolution, cost, clearance)
+    left, below = rim - math.floor(min(across)), rim - math.floor(min(along))
+    shape = below + math.ceil(max(along)) + rim, left + math.ceil(max(across)) + rim
+    log_odds = np.zeros(shape, np.float32)
+    log_odds[below : below + rows, left : left + columns] = grid.log_odds
+    return CostMap(
+        resolution,
+        np.array((x - left * resolution, y - below * resolution)),
+        log_odds,
+        occupied_above,
+        radius,
+        soft_margin,
+        soft_cost,
+        unknown_cost,
+    )
 
 
 @compiled("void(f4[:,::1], f8[:,::1], f8, f8, f8, f8, f8[:,::1])")
@@ -190,10 +224,24 @@ def nearest_reachable(cost: Array, start: Cell, goal: Cell) -> Cell:
 
 def line_cost(costs: CostMap, a: Array, b: Array) -> float:
     """Returns what it costs to drive straight from a to b (2,) m; inf where it cannot be done."""
-    length = float(np.hypot(*(b - a)))
-    n = max(math.ceil(length / (0.5 * costs.resolution)), 1)
-    points = a + ((np.arange(n) + 0.5) / n)[:, None] * (b - a)
-    return length * float(costs.at(points, costs.cost).mean())
+    return _line_cost(costs.cost, packed(costs.origin), costs.resolution, packed(a), packed(b))
+
+
+@compiled("f8(f8[:,::1], f8[::1], f8, f8[::1], f8[::1])")
+def _line_cost(cost: Array, origin: Array, resolution: float, a: Array, b: Array) -> float:
+    rows, columns = cost.shape
+    dx, dy = b[0] - a[0], b[1] - a[1]
+    length = math.hypot(dx, dy)
+    n = max(math.ceil(length / (0.5 * resolution)), 1)
+    total = 0.0
+    for k in range(n):
+        share = (k + 0.5) / n
+        column = math.floor((a[0] + share * dx - origin[0]) / resolution)
+        row = math.floor((a[1] + share * dy - origin[1]) / resolution)
+        if not (0 <= row < rows and 0 <= column < columns):
+            return math.inf
+        total += cost[row, column]
+    return length * total / n
 
 
 def is_clear(costs: CostMap, points: Array, position: Array, radius: float) -> bool:
@@ -201,11 +249,46 @@ def is_clear(costs: CostMap, points: Array, position: Array, radius: float) -> b
 
     That is nearer than the radius, or, for a robot that is nearer already, than it is now.
     """
-    here = float(costs.at(position[None], costs.clearance)[0])
-    least = min(radius, here) - costs.resolution / 2
-    n = max(math.ceil(length_of(points) / (costs.resolution / 2)), 1)
-    along = points_along(points, np.linspace(0, length_of(points), n + 1))
-    return bool((costs.at(along, costs.clearance) >= least).all())
+    frame = np.array((*costs.origin, costs.resolution, costs.occupied_above))
+    return _is_clear(costs.log_odds, frame, packed(points), packed(position), radius)
+
+
+@compiled("b1(f4[:,::1], f8[::1], f8[:,::1], f8[::1], f8)")
+def _is_clear(
+    log_odds: NDArray[np.float32], frame: Array, points: Array, position: Array, radius: float
+) -> bool:
+    resolution = frame[2]
+    here = _clearance_at(log_odds, frame, position[0], position[1], radius)
+    least = min(radius, here) - resolution / 2
+    for k in range(max(len(points) - 1, 1)):
+        after = min(k + 1, len(points) - 1)
+        dx, dy = points[after, 0] - points[k, 0], points[after, 1] - points[k, 1]
+        n = max(math.ceil(math.hypot(dx, dy) / (resolution / 2)), 1)
+        for i in range(n + 1):
+            x, y = points[k, 0] + i / n * dx, points[k, 1] + i / n * dy
+            if not _clearance_at(log_odds, frame, x, y, radius) >= least:
+                return False
+    return True
+
+
+@compiled()
+def _clearance_at(
+    log_odds: NDArray[np.float32], frame: Array, x: float, y: float, reach: float
+) -> float:
+    """Returns the clearance of a cell, m, as far as it is less than `reach`; else that or more."""
+    resolution = frame[2]
+    rows, columns = log_odds.shape
+    column = math.floor((x - frame[0]) / resolution)
+    row = math.floor((y - frame[1]) / resolution)
+    if not (0 <= row < rows and 0 <= column < columns):
+        return math.inf
+    cells = math.ceil(reach / resolution + 0.5)
+    nearest = math.inf
+    for j in range(max(row - cells, 0), min(row + cells + 1, rows)):
+        for i in range(max(column - cells, 0), min(column + cells + 1, columns)):
+            if log_odds[j, i] > frame[3]:
+                nearest = min(nearest, float((j - row) ** 2 + (i - column) ** 2))
+    return (math.sqrt(nearest) - 0.5) * resolution
 
 
 def steering_point(

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
+
+from systems.compiled import compiled, packed
 
 Array = NDArray[np.float64]
 
@@ -23,14 +27,27 @@ def rest_of(points: Array, position: Array) -> Array:
     """
     if len(points) == 1:
         return points
-    a, along = points[:-1], np.diff(points, axis=0)
-    squared = np.maximum((along**2).sum(axis=1), 1e-12)
-    share = np.clip(((position - a) * along).sum(axis=1) / squared, 0, 1)
-    nearest = a + share[:, None] * along
-    # Of equally near places the last: at a corner it is that of the piece that is to come.
-    distance = np.hypot(*(nearest - position).T)
-    k = len(distance) - 1 - int(np.argmin(distance[::-1]))
-    return np.concatenate([nearest[k : k + 1], points[k + 1 :]])
+    rest = np.array(points)
+    return rest[_cut(rest, packed(position)) :]
+
+
+@compiled("i8(f8[:,::1], f8[::1])")
+def _cut(points: Array, position: Array) -> int:
+    """Moves the point before the nearest place to that place; returns which point that is."""
+    nearest, least = 0, math.inf
+    place_x, place_y = points[0, 0], points[0, 1]
+    for k in range(len(points) - 1):
+        dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+        squared = max(dx * dx + dy * dy, 1e-12)
+        along = (position[0] - points[k, 0]) * dx + (position[1] - points[k, 1]) * dy
+        share = min(max(along / squared, 0.0), 1.0)
+        x, y = points[k, 0] + share * dx, points[k, 1] + share * dy
+        distance = math.hypot(x - position[0], y - position[1])
+        # Of equally near places the last: at a corner it is that of the piece that is to come.
+        if distance <= least:
+            nearest, least, place_x, place_y = k, distance, x, y
+    points[nearest, 0], points[nearest, 1] = place_x, place_y
+    return nearest
 
 
 def points_along(points: Array, distances: Array) -> Array:

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from systems.controllers.braking import CollisionMonitorParameters
 from systems.controllers.collision_monitor import safe_command
 from systems.messages import OccupancyGrid, Scan
-from systems.planners.astar import AStarParameters, plan, shortest_way
+from systems.planners.astar import AStarParameters, plan
 from systems.planners.cost_map import CostMap, cost_map
+from systems.planners.grid_search import shortest_way
 from systems.planners.occupancy import OccupancyParameters, cells_of, empty_grid, with_scan
 from systems.planners.polyline import length_of
 from systems.planners.sonar_grid import (

@@ -17,9 +17,9 @@ from systems.planners.astar import (
     AStarPlanner,
     plan,
     pulled_straight,
-    shortest_way,
 )
 from systems.planners.cost_map import CostMap, cost_map, driving_cost
+from systems.planners.grid_search import shortest_way
 from systems.planners.polyline import length_of
 from tests.systems.planners.drawn import drawn, room
 
