@@ -8,7 +8,6 @@ on octrees", Autonomous Robots 34, 2013.
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem, OutputPort, State
 
-from systems.compiled import compiled, packed
+from systems.compiled import compiled, in_rows, packed
 from systems.health import Counts
 from systems.messages import OccupancyGrid, Scan
 from systems.pose_trail import empty_trail, poses_at, ray_poses, remember
@@ -127,16 +126,17 @@ def grown(grid: OccupancyGrid, points: Array, *, growth: float, max_side: float)
     Raises:
         ValueError: a side would have to be longer than max_side.
     """
-    shape = np.array(grid.log_odds.shape)
     low, high = points.min(axis=0), points.max(axis=0)
     least, most = (low - grid.origin) / grid.resolution, (high - grid.origin) / grid.resolution
+    rows, columns = grid.log_odds.shape
+    if min(least.tolist()) >= 0 and most[0] < columns and most[1] < rows:
+        return grid
+    shape = np.array((rows, columns))
     cells = np.maximum(most[::-1], shape) - np.minimum(least[::-1], 0)
     if cells.max() > max_side / grid.resolution:
         raise ValueError(f"the grid would be longer than {max_side} m")
     before = np.maximum(-np.floor(least[::-1]).astype(int), 0)
     after = np.maximum(np.floor(most[::-1]).astype(int) + 1 - shape, 0)
-    if not before.any() and not after.any():
-        return grid
     block = math.ceil(growth / grid.resolution)
     before, after = -(-before // block) * block, -(-after // block) * block
     return OccupancyGrid(
@@ -168,27 +168,15 @@ def with_scan(
     """
     p = parameters
     reach = min(p.max_range, scan.range_max)
-    nothing = np.isposinf(scan.ranges)
-    usable = (scan.ranges >= scan.range_min) & np.isfinite(rays).all(axis=1)
-    usable &= (scan.ranges <= scan.range_max) | nothing
-    rays, ranges, nothing = rays[usable], scan.ranges[usable], nothing[usable]
-    is_hit = ranges <= reach
-    ranges = np.minimum(ranges, np.where(nothing, min(p.max_free_range, reach), reach))
-    is_hit &= ~nothing
-    direction = np.stack([np.cos(rays[:, 2]), np.sin(rays[:, 2])], axis=-1)
-    ends = rays[:, :2] + ranges[:, None] * direction
-    if len(ends) == 0:
+    limits = np.array((scan.range_min, scan.range_max, reach, min(p.max_free_range, reach)))
+    ways, box = np.empty((len(scan), 6)), np.empty((2, 2))
+    ways = ways[: _follow(packed(scan.ranges), in_rows(rays, 3), limits, ways, box)]
+    if len(ways) == 0:
         return grid
-    corners = np.concatenate([ends, rays[:, :2]])
-    grid = grown(grid, corners, growth=p.growth, max_side=p.max_side)
-
-    free = np.where(is_hit, ranges - grid.resolution / 2, ranges) / grid.resolution
-    # In cells from the grid's corner.
-    starts = (rays[:, :2] - grid.origin) / grid.resolution
-    stops = (ends - grid.origin) / grid.resolution
+    grid = grown(grid, box, growth=p.growth, max_side=p.max_side)
     log_odds = np.array(grid.log_odds, np.float32, order="C")
-    limits = np.array((p.miss, p.hit, p.least, p.most))
-    _mark(packed(starts), packed(direction), packed(stops), free, is_hit, limits, log_odds)
+    frame = np.array((*grid.origin.tolist(), grid.resolution))
+    _mark(ways, frame, np.array((p.miss, p.hit, p.least, p.most)), log_odds)
     return OccupancyGrid(
         stamp=scan.stamp,
         frame_id=grid.frame_id,
@@ -198,38 +186,59 @@ def with_scan(
     )
 
 
-@compiled("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], b1[::1], f8[::1], f4[:,::1])")
-def _mark(
-    starts: Array,
-    directions: Array,
-    stops: Array,
-    free: Array,
-    is_hit: NDArray[np.bool_],
-    limits: Array,
-    log_odds: NDArray[np.float32],
-) -> None:
-    """Changes the log-odds by what n rays say.
+@compiled("i8(f8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1])")
+def _follow(ranges: Array, rays: Array, limits: Array, ways: Array, box: Array) -> int:
+    """Writes how far each ray that says something is followed; returns how many those are.
 
     Args:
-        starts: (n, 2) x, y in cells.
-        directions: (n, 2) of length 1.
-        stops: (n, 2) where the rays ended, in cells.
-        free: (n,) how far each ray was free, in cells; negative for nowhere.
-        is_hit: (n,) whether it hit something where it ended.
+        ranges: (n,) m.
+        rays: (n, 3), see `with_scan`.
+        limits: range_min, range_max, how far rays are followed, and those that hit nothing, m.
+        ways: (n, 6) [x (m), y (m), cos, sin, length (m), whether it hit something at its end].
+        box: (2, 2) the least and the largest x, y of all ways, m.
+    """
+    n = 0
+    box[0], box[1] = math.inf, -math.inf
+    for k in range(len(ranges)):
+        nothing = ranges[k] == math.inf
+        usable = ranges[k] >= limits[0] and (nothing or ranges[k] <= limits[1])
+        x, y, direction = rays[k, 0], rays[k, 1], rays[k, 2]
+        if not usable or not math.isfinite(x + y + direction):
+            continue
+        c, s = math.cos(direction), math.sin(direction)
+        length = min(ranges[k], limits[3] if nothing else limits[2])
+        ways[n, 0], ways[n, 1], ways[n, 2], ways[n, 3], ways[n, 4] = x, y, c, s, length
+        ways[n, 5] = 0.0 if nothing or ranges[k] > limits[2] else 1.0
+        end_x, end_y = x + length * c, y + length * s
+        box[0, 0], box[0, 1] = min(box[0, 0], x, end_x), min(box[0, 1], y, end_y)
+        box[1, 0], box[1, 1] = max(box[1, 0], x, end_x), max(box[1, 1], y, end_y)
+        n += 1
+    return n
+
+
+@compiled("void(f8[:,::1], f8[::1], f8[::1], f4[:,::1])")
+def _mark(ways: Array, frame: Array, limits: Array, log_odds: NDArray[np.float32]) -> None:
+    """Changes the log-odds by what the rays say.
+
+    Args:
+        ways: see `_follow`.
+        frame: x, y of the grid's corner and side of a cell, m.
         limits: miss, hit, least, most.
         log_odds: changed.
     """
     miss, hit, least, most = limits[0], limits[1], limits[2], limits[3]
+    side = frame[2]
     seen: NDArray[np.int8] = np.zeros(log_odds.shape, np.int8)  # 1 free, 2 hit
     rows, columns = log_odds.shape
-    for k in range(len(starts)):
-        for n in range(int(max(free[k], 0.0) * 2)):  # looked at every half a cell
-            x = starts[k, 0] + n / 2 * directions[k, 0]
-            y = starts[k, 1] + n / 2 * directions[k, 1]
-            seen[int(y), int(x)] = 1
-    for k in range(len(starts)):
-        if is_hit[k]:
-            seen[math.floor(stops[k, 1]), math.floor(stops[k, 0])] = 2
+    for k in range(len(ways)):
+        x, y = (ways[k, 0] - frame[0]) / side, (ways[k, 1] - frame[1]) / side
+        free = (ways[k, 4] - ways[k, 5] * side / 2) / side  # up to half a cell before what it hit
+        for n in range(int(max(free, 0.0) * 2)):  # looked at every half a cell
+            seen[int(y + n / 2 * ways[k, 3]), int(x + n / 2 * ways[k, 2])] = 1
+    for k in range(len(ways)):
+        if ways[k, 5] > 0:
+            x, y = ways[k, 0] + ways[k, 4] * ways[k, 2], ways[k, 1] + ways[k, 4] * ways[k, 3]
+            seen[math.floor((y - frame[1]) / side), math.floor((x - frame[0]) / side)] = 2
     for row in range(rows):
         for column in range(columns):
             if seen[row, column]:
@@ -343,24 +352,23 @@ class OccupancyMapper(LeafSystem):
 
     def _look(self, context: Context, state: State) -> EventStatus:
         discrete_state: Any = state.get_mutable_discrete_state()
-        counts: Counter[str] = Counter()
         trail = context.get_discrete_state(self._trail).get_value().reshape(-1, 4)
         pose = self._pose_input.Eval(context)
-        if np.isfinite(pose).all():
+        bad_pose = not all(map(math.isfinite, pose.tolist()))
+        if not bad_pose:
             trail = remember(trail, context.get_time(), pose)
             discrete_state.set_value(self._trail, trail.ravel())
-        else:
-            counts["bad_pose"] += 1
+        counts = {"bad_pose": int(bad_pose)}
         scan = self._scan_input.Eval(context)
         last_stamp = context.get_discrete_state(self._last_stamp)[0]
         if not math.isnan(scan.stamp) and scan.stamp != last_stamp:
             discrete_state.set_value(self._last_stamp, [scan.stamp])
             grid = context.get_abstract_state(self._grid).get_value()
             verdict, grid = self._take(grid, scan, trail, context)
-            counts[verdict] += 1
             if verdict == "taken":
                 state.get_mutable_abstract_state(int(self._grid)).set_value(grid)
-        del counts["taken"], counts["no_scan"]
+            elif verdict in REASONS:
+                counts[verdict] = counts.get(verdict, 0) + 1
         self._counts.add(context, discrete_state, **counts)
         return EventStatus.Succeeded()
 
@@ -372,8 +380,7 @@ class OccupancyMapper(LeafSystem):
         fault = scan_fault(scan, now, p.max_scan_age)
         if fault is not None:
             return fault, grid
-        covariance = self._covariance_input.Eval(context).reshape(3, 3)
-        if self._is_lost(covariance):
+        if self._is_lost(self._covariance_input.Eval(context)):
             return "lost", grid
         end = scan.stamp + scan.time_increment * (len(scan) - 1)
         known = trail[np.isfinite(trail[:, 0]), 0]
@@ -390,12 +397,9 @@ class OccupancyMapper(LeafSystem):
             return "out_of_bounds", grid
 
     def _is_lost(self, covariance: Array) -> bool:
-        if not np.isfinite(covariance).all():
+        xx, xy, _, _, yy, _, _, _, tt = elements = covariance.tolist()
+        if not all(map(math.isfinite, elements)) or min(xx, yy, tt) < 0:
             return True
-        position = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+        position = (xx + yy) / 2 + math.hypot((xx - yy) / 2, xy)  # along its worst axis
         p = self._parameters
-        return (
-            position > p.max_position_std**2
-            or covariance[2, 2] > p.max_heading_std**2
-            or bool((np.diag(covariance) < 0).any())
-        )
+        return bool(position > p.max_position_std**2 or tt > p.max_heading_std**2)
