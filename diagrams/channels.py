@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,17 +15,21 @@ from systems.io.playback import MessagePlayback, VectorPlayback, read_channel
 from systems.io.recorder import Channel
 from systems.io.ros_motion import (
     command_from_ros,
+    command_to_ros,
     estimate_to_ros,
     imu_from_ros,
     imu_to_ros,
     planar_estimate_from_ros,
     planar_estimate_to_ros,
+    planar_fields,
     planar_pose_to_ros,
+    planar_transforms_to_ros,
     pose_from_ros,
     pose_to_ros,
 )
 from systems.io.ros_types import message_class
 from systems.io.ros_wheels import wheel_angles_from_ros, wheel_angles_to_ros
+from systems.io.stencils import Stencil
 from systems.messages import CameraImage, Detections, PointMatches, PoseEstimate, Scan
 from systems.pose_vector import pose_from_vector, pose_to_vector
 from systems.shell.angles import SHELL_FRAME
@@ -102,12 +106,14 @@ def imu_signal(device: str, rate: float, gyro_density: float, accel_density: flo
     return Signal(
         port=f"{device}.sample",
         topic=topic_of(device),
-        encode=lambda value, t: imu_to_ros(
-            value,
-            stamp=t,
-            frame_id=device.replace(".", "/"),
-            gyro_variance=gyro_density**2 * rate,
-            accel_variance=accel_density**2 * rate,
+        encode=Stencil(
+            lambda t: imu_to_ros(
+                np.full(6, np.nan),
+                stamp=t,
+                frame_id=device.replace(".", "/"),
+                gyro_variance=gyro_density**2 * rate,
+                accel_variance=accel_density**2 * rate,
+            )
         ),
         decode=imu_from_ros,
         model=6,
@@ -120,7 +126,7 @@ def command_signal(device: str, rate: float) -> Signal:
     return Signal(
         port=f"{device}.sent",
         topic=topic_of(f"{device}.sent"),
-        encode="geometry_msgs/msg/Twist",
+        encode=Stencil(lambda _: command_to_ros(np.full(2, np.nan))),
         decode=command_from_ros,
         model=2,
         rate=rate,
@@ -133,8 +139,11 @@ def ticks_signal(device: str, rate: float, ticks_per_turn: float) -> Signal:
     return Signal(
         port=f"{device}.ticks",
         topic=topic_of(device),
-        encode=lambda value, t: wheel_angles_to_ros(
-            angle * value, stamp=t, frame_id=device.replace(".", "/")
+        encode=Stencil(
+            lambda t: wheel_angles_to_ros(
+                np.full(2, np.nan), stamp=t, frame_id=device.replace(".", "/")
+            ),
+            lambda ticks: angle * ticks,
         ),
         decode=lambda message: np.rint(wheel_angles_from_ros(message) / angle),
         model=2,
@@ -183,7 +192,10 @@ def truth_signal(robot: str) -> Signal:
     return Signal(
         port=f"truth.{robot}.pose",
         topic=f"/truth/{robot}/pose",
-        encode=lambda value, t: planar_pose_to_ros(value, stamp=t, frame_id="map"),
+        encode=Stencil(
+            lambda t: planar_pose_to_ros(np.full(3, np.nan), stamp=t, frame_id="map"),
+            planar_fields,
+        ),
         decode=lambda message: planar_pose(pose_from_ros(message)),
         model=3,
         rate=50.0,
@@ -196,8 +208,11 @@ def estimate_signal(robot: str, rate: float) -> Signal:
     return Signal(
         port=f"{robot}.estimate",
         topic=f"/{robot}/estimate",
-        encode=lambda value, t: planar_estimate_to_ros(
-            value[:3], value[3:].reshape(3, 3), stamp=t, frame_id="map"
+        encode=Stencil(
+            lambda t: planar_estimate_to_ros(
+                np.full(3, np.nan), np.full((3, 3), np.nan), stamp=t, frame_id="map"
+            ),
+            lambda value: [*planar_fields(value[:3]), *value[3:]],
         ),
         decode=lambda message: np.concatenate(
             [part.ravel() for part in planar_estimate_from_ros(message)]
@@ -205,6 +220,17 @@ def estimate_signal(robot: str, rate: float) -> Signal:
         model=12,
         rate=rate,
         played=False,
+    )
+
+
+def planar_frames(children: Sequence[str]) -> Stencil:
+    """Returns the encoder of /tf for a vector that begins with the frames' planar poses in map."""
+    n = len(children)
+    return Stencil(
+        lambda t: planar_transforms_to_ros(
+            np.full((n, 3), np.nan), stamp=t, frame_id="map", child_frame_ids=children
+        ),
+        lambda value: [x for k in range(n) for x in planar_fields(value[3 * k : 3 * k + 3])],
     )
 
 
@@ -274,7 +300,7 @@ def number_signal(port: str, rate: float) -> Signal:
     return Signal(
         port=port,
         topic=topic_of(port),
-        encode=lambda value, _: message_class("std_msgs/msg/Float64")(float(value[0])),
+        encode=Stencil(lambda _: message_class("std_msgs/msg/Float64")(np.nan)),
         decode=lambda message: np.array([float(message.data)]),
         model=1,
         rate=rate,

@@ -5,17 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import System
 from pydrake.systems.primitives import MatrixGain, Multiplexer
 
-from diagrams.channels import Signal, estimate_signal
+from diagrams.channels import Signal, estimate_signal, planar_frames
 from diagrams.mission import Wiring
-from systems.angles import spatial_pose
-from systems.io.ros_motion import FrameTransform, transforms_to_ros
 
 Array = NDArray[np.float64]
 
@@ -43,18 +40,12 @@ def record_estimates(wiring: Wiring, names: Sequence[str]) -> None:
         wiring.builder.Connect(joint.get_output_port(), part.get_input_port())
         wiring.record(f"{name}_estimate.y0", estimate_signal(name, rate=RATE))
 
-    def to_tf(value: Array, t: float) -> Any:
-        poses = zip(names, value.reshape(-1, 3), strict=True)
-        return transforms_to_ros(
-            [FrameTransform(t, "map", f"{name}/base_link", spatial_pose(x)) for name, x in poses]
-        )
-
     wiring.record(
         "estimator.poses",
         Signal(
             port="tf",
             topic="/tf",
-            encode=to_tf,
+            encode=planar_frames([f"{name}/base_link" for name in names]),
             decode=None,
             model=3 * n,
             rate=RATE,

@@ -16,7 +16,7 @@ from pydrake.systems.framework import Context
 from pydrake.systems.primitives import Multiplexer
 
 from diagrams.avoidance import AVOIDERS, PLANNERS, Avoidance
-from diagrams.channels import estimate_signal
+from diagrams.channels import estimate_signal, planar_frames
 from diagrams.metrics import (
     PoseLog,
     clearance_metrics,
@@ -33,11 +33,9 @@ from diagrams.trajectories import write_tum
 from diagrams.viewer import EstimateViewer
 from diagrams.world import WorldParameters
 from plants.arena import check_free
-from systems.angles import spatial_pose
 from systems.controllers.braking import CollisionMonitorParameters
 from systems.controllers.search import SearchParameters, SearchWhenLost
 from systems.estimators.planar_kalman import UNKNOWN
-from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.localizer import Localizer, LocalizerParameters, MapLocalizer
 from systems.planners.occupancy import OccupancyParameters
 from systems.planners.progress import ProgressParameters
@@ -211,9 +209,8 @@ class NavigationMission(Mission):
             wiring.log(name)
         signal = estimate_signal(ROBOT, rate=50.0)
         wiring.record("estimate.y0", signal)
-        wiring.record(
-            "estimate.y0", replace(signal, port="tf", topic="/tf", encode=_estimate_to_tf)
-        )
+        frames = planar_frames([f"{ROBOT}/base_link"])
+        wiring.record("estimate.y0", replace(signal, port="tf", topic="/tf", encode=frames))
 
     def outcome(self, context: Context) -> str | None:
         """Returns `reached` when the last waypoint is, `blocked` when the robot gives up.
@@ -325,8 +322,3 @@ def _show(wiring: Wiring, scenario: NavigationScenario, meshcat: Meshcat, has_tr
     wiring.connect("estimator.covariance", "viewer.covariance")
     if has_truth:
         wiring.connect(f"truth.{ROBOT}.pose", "viewer.truth")
-
-
-def _estimate_to_tf(value: np.ndarray, t: float) -> Any:
-    X_WB = spatial_pose(value[:3])
-    return transforms_to_ros([FrameTransform(t, "map", f"{ROBOT}/base_link", X_WB)])

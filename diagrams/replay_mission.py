@@ -15,7 +15,7 @@ from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context
 from pydrake.systems.primitives import Multiplexer
 
-from diagrams.channels import estimate_signal
+from diagrams.channels import estimate_signal, planar_frames
 from diagrams.metrics import PoseLog, nis_mean, path_length, pose_metrics
 from diagrams.mission import FRAME_RATE, Mission, Wiring
 from diagrams.replay_log import ReplayLog, replay_metrics
@@ -23,12 +23,10 @@ from diagrams.replay_viewer import show_route
 from diagrams.tables import Choice
 from diagrams.trajectories import write_tum
 from diagrams.viewer import EstimateViewer
-from systems.angles import spatial_pose
 from systems.controllers.path_tracking import TrackingParameters
 from systems.controllers.replay_supervisor import STATUSES, ReplaySupervisor
 from systems.controllers.wheel_drive import WheelDriveParameters
 from systems.estimators.planar_kalman import UNKNOWN
-from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.io.ros_types import message_class
 from systems.markers.layout import MarkerMap
 from systems.markers.localizer import Localizer, MapLocalizer
@@ -152,7 +150,8 @@ class ReplayMission(Mission):
             wiring.log(name)
         signal = estimate_signal(ROBOT, rate=50.0)
         wiring.record("estimate.y0", signal)
-        wiring.record("estimate.y0", replace(signal, port="tf", topic="/tf", encode=_to_tf))
+        frames = planar_frames([f"{ROBOT}/base_link"])
+        wiring.record("estimate.y0", replace(signal, port="tf", topic="/tf", encode=frames))
         wiring.record(
             "supervisor.verdict",
             replace(
@@ -259,8 +258,3 @@ def _within_drive(controller: Choice, drive: WheelDriveParameters) -> Choice:
 
 def _status(value: np.ndarray, _: float) -> Any:
     return message_class("std_msgs/msg/String")(STATUSES[int(value[1])])
-
-
-def _to_tf(value: np.ndarray, t: float) -> Any:
-    X_WB = spatial_pose(value[:3])
-    return transforms_to_ros([FrameTransform(t, "map", f"{ROBOT}/base_link", X_WB)])

@@ -20,6 +20,7 @@ from plants.clearance import ClearanceMonitor
 from plants.footprint import footprint
 from plants.moving import MODEL, MovingObstacles, starting_points
 from systems.io.ros_types import message_class
+from systems.io.stencils import Stencil
 
 if TYPE_CHECKING:
     from diagrams.station import Robot, StationBuilder
@@ -158,7 +159,7 @@ def clearance_signal(robot: str) -> Signal:
     return Signal(
         port=f"truth.{robot}.clearance",
         topic=f"/truth/{robot}/clearance",
-        encode=lambda value, _: message_class("std_msgs/msg/Float64")(float(value[0])),
+        encode=Stencil(lambda _: message_class("std_msgs/msg/Float64")(np.nan)),
         decode=_number,
         model=1,
         rate=10.0,

@@ -12,9 +12,11 @@ from systems.io.ros_motion import (
     estimate_to_ros,
     odometry_from_ros,
     odometry_to_ros,
+    planar_fields,
     transforms_to_ros,
 )
 from systems.io.ros_types import message_class
+from systems.io.stencils import Stencil
 from systems.mapping.tag_frames import TagFrame
 from systems.messages import PoseEstimate
 
@@ -22,11 +24,11 @@ from systems.messages import PoseEstimate
 def odometry_signal(robot: str, rate: float) -> Signal:
     """Returns the signal of wheel odometry: (14,) pose, covariance by rows, velocity."""
 
-    def encode(value: np.ndarray, t: float) -> Any:
+    def example(t: float) -> Any:
         return odometry_to_ros(
-            value[:3],
-            value[3:12].reshape(3, 3),
-            value[12:],
+            np.full(3, np.nan),
+            np.full((3, 3), np.nan),
+            np.full(2, np.nan),
             stamp=t,
             frame_id=f"{robot}/odom",
             child_frame_id=f"{robot}/base_link",
@@ -38,7 +40,7 @@ def odometry_signal(robot: str, rate: float) -> Signal:
     return Signal(
         port=f"{robot}.odom",
         topic=f"/{robot}/odom",
-        encode=encode,
+        encode=Stencil(example, lambda value: [*planar_fields(value[:3]), *value[3:]]),
         decode=decode,
         model=14,
         rate=rate,

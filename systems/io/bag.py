@@ -18,6 +18,7 @@ from systems.io.record import Record
 from systems.io.ros_types import definition, first_line, nanoseconds, seconds, typestore
 from systems.io.rosbag1_scan import Rosbag1Scan
 from systems.io.rosbags_reader import RosbagsSource
+from systems.io.stencils import SerialisedMessage
 from systems.validation import nearest, require, require_positive
 
 # Reliable, and kept for subscribers that come later, as tf2_ros offers /tf_static. The numbers are
@@ -113,7 +114,7 @@ class BagWriter:
         Args:
             topic: where it is published; a new one is added.
             msgtype: in ROS 2's naming, such as `geometry_msgs/msg/Twist`.
-            message: of that type, made by `systems.io.ros_messages`.
+            message: of that type, made by `systems.io.ros_messages`, or serialised already.
             log_time: s, 0 or later.
             latched: for a new topic: late subscribers get its last message, as with /tf_static.
 
@@ -127,11 +128,9 @@ class BagWriter:
         moment = nanoseconds(log_time)
         require(moment >= 0, "log_time", log_time, "0 or later")
         channel, known, _ = self._topics.get(topic) or self._add(topic, msgtype, latched)
-        require(msgtype == known, f"type of {topic}", msgtype, f"{known} as before")
-        try:
-            data = typestore().serialize_cdr(message, msgtype)
-        except Exception as error:  # whatever a wrong field trips in the compiled serialiser
-            raise ValueError(f"message on {topic} is no {msgtype}: {first_line(error)}") from error
+        if msgtype != known:
+            require(False, f"type of {topic}", msgtype, f"{known} as before")
+        data = _serialised(topic, msgtype, message)
         failure: OSError | None = None
         if (chunk := moment // self._chunk_length) != self._chunk:
             self._chunk = chunk
@@ -321,6 +320,15 @@ class BagReader:
             except ValueError as error:
                 raise ValueError(f"recording {self.path}: {error}") from error
             yield record.topic, seconds(record.log_time), message
+
+
+def _serialised(topic: str, msgtype: str, message: Any) -> bytes | memoryview:
+    if isinstance(message, SerialisedMessage) and message.__msgtype__ == msgtype:
+        return message.data
+    try:
+        return typestore().serialize_cdr(message, msgtype)
+    except Exception as error:  # whatever a wrong field trips in the compiled serialiser
+        raise ValueError(f"message on {topic} is no {msgtype}: {first_line(error)}") from error
 
 
 def _is_recording(path: Path) -> bool:

@@ -31,7 +31,8 @@ class Channel:
         port: name of the input port.
         topic: where it is published in the recording.
         encode: a message type, such as `sensor_msgs/msg/Imu`, for its usual conversion, or a
-            function of the port's value and the time (s) that returns a ROS message.
+            function of the port's value and the time (s) that returns a ROS message, such as a
+            `systems.io.stencils.Stencil`.
         model: what the port carries: a number n for a vector of n, else an example of the message
             (`Detections()`, `RigidTransform()`).
         rate: how often the port is looked at, Hz.
@@ -71,6 +72,45 @@ class Channel:
     def is_vector(self) -> bool:
         """Whether the port carries a vector."""
         return isinstance(self.model, int)
+
+
+@dataclass(slots=True)
+class _Tap:
+    """A channel and what of it is in the file already: the file's state, not the diagram's.
+
+    Attributes:
+        port: where it is looked at.
+        topic: see `Channel`.
+        encode: makes its messages.
+        only_new: see `Channel`.
+        repeat: see `Channel`.
+        stamp: of the last message, s.
+        vector: the last one's bytes.
+        since: when that was written, s.
+    """
+
+    port: InputPort
+    topic: str
+    encode: Encoder
+    only_new: bool
+    repeat: float
+    stamp: float = math.nan
+    vector: bytes = b""
+    since: float = -math.inf
+
+    def is_due(self, value: Any, t: float) -> bool:
+        """Whether a value is to be written at `t` (s); then it counts as written."""
+        if self.repeat > 0:
+            now = value.tobytes()
+            if now == self.vector and t < self.since + self.repeat - 1e-9:
+                return False
+            self.vector, self.since = now, t
+            return True
+        stamp = getattr(value, "stamp", t)
+        if math.isnan(stamp) or (self.only_new and stamp == self.stamp):
+            return False
+        self.stamp = stamp
+        return True
 
 
 def _make_serialiser(channel: Channel, encode: Encoder) -> None:
@@ -135,13 +175,10 @@ class Recorder(LeafSystem):
         self._refused = 0
         # Made into ROS messages when a chunk begins, all at once: one after the other, between
         # what else a simulation does, takes twice as long.
-        self._waiting: list[tuple[str, Encoder, Any, float]] = []
+        self._waiting: list[tuple[_Tap, Any, float]] = []
         self._chunk: int | None = None
         self._warned: set[str] = set()
-        # What the file holds already is the file's state, not the diagram's.
-        self._written_stamps: dict[str, float] = {}
-        self._written_vectors: dict[str, tuple[bytes, float]] = {}
-        groups: dict[float, list[tuple[Channel, InputPort, Encoder]]] = {}
+        groups: dict[float, list[_Tap]] = {}
         for channel in channels:
             port = (
                 self.DeclareVectorInputPort(channel.port, channel.model)
@@ -149,7 +186,8 @@ class Recorder(LeafSystem):
                 else self.DeclareAbstractInputPort(channel.port, AbstractValue.Make(channel.model))
             )
             encode = encoder(channel.encode) if isinstance(channel.encode, str) else channel.encode
-            groups.setdefault(channel.rate, []).append((channel, port, encode))
+            tap = _Tap(port, channel.topic, encode, channel.only_new, channel.repeat)
+            groups.setdefault(channel.rate, []).append(tap)
             _make_serialiser(channel, encode)
         self.DeclareInitializationPublishEvent(self._record_static)
         for rate, group in groups.items():
@@ -176,28 +214,16 @@ class Recorder(LeafSystem):
 
     def _record(
         self,
-        group: list[tuple[Channel, InputPort, Encoder]],
+        group: list[_Tap],
         context: Context,
         discrete_state: DiscreteValues,  # noqa: ARG002 - Drake's signature; there is no state
     ) -> None:
         t = context.get_time()
-        for channel, port, encode in group:
-            value = port.Eval(context)
-            stamp = getattr(value, "stamp", t)
-            if math.isnan(stamp):
-                continue
-            if channel.only_new:
-                if stamp == self._written_stamps.get(channel.port):
-                    continue
-                self._written_stamps[channel.port] = stamp
-            elif channel.repeat > 0:
-                last, since = self._written_vectors.get(channel.port, (b"", t))
-                now = value.tobytes()
-                if now == last and t < since + channel.repeat - 1e-9:
-                    continue
-                self._written_vectors[channel.port] = now, t
-            # Of a pose Drake shows the one in its cache, which will change.
-            self._waiting.append((channel.topic, encode, copy(value), t))
+        for tap in group:
+            value = tap.port.Eval(context)
+            if tap.is_due(value, t):
+                # Of a pose Drake shows the one in its cache, which will change.
+                self._waiting.append((tap, copy(value), t))
         chunk = self._writer.chunk(t)
         if chunk != self._chunk:
             self._chunk = chunk
@@ -205,13 +231,13 @@ class Recorder(LeafSystem):
 
     def _write_waiting(self) -> None:
         waiting, self._waiting = self._waiting, []
-        for topic, encode, value, t in waiting:
+        for tap, value, t in waiting:
             try:
-                message = encode(value, t)
+                message = tap.encode(value, t)
             except ValueError as error:
-                self._refuse(topic, error)
+                self._refuse(tap.topic, error)
                 continue
-            self._write(topic, message.__msgtype__, message, t)
+            self._write(tap.topic, message.__msgtype__, message, t)
 
     def _write(
         self, topic: str, msgtype: str, message: Any, t: float, latched: bool = False

@@ -7,7 +7,7 @@ nowhere else. What ROS has no field for is lost, and named. The readers take ROS
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -202,6 +202,16 @@ def planar_pose_to_ros(pose: Array, *, stamp: float, frame_id: str) -> Any:
     )
 
 
+def planar_fields(pose: Array) -> tuple[float, float, float, float]:
+    """Returns what of a ROS pose a planar one (3,) [x (m), y (m), theta (rad)] tells.
+
+    Returns:
+        x and y of the position (m), z and w of the quaternion; the rest is 0.
+    """
+    x, y, theta = np.asarray(pose, float).tolist()
+    return x, y, math.sin(theta / 2), math.cos(theta / 2)
+
+
 def pose_from_ros(message: Any) -> RigidTransform:
     """Returns the pose of a `PoseStamped`.
 
@@ -226,6 +236,22 @@ def transforms_to_ros(transforms: Iterable[FrameTransform]) -> Any:
             for entry in transforms
         ]
     )
+
+
+def planar_transforms_to_ros(
+    poses: Array, *, stamp: float, frame_id: str, child_frame_ids: Sequence[str]
+) -> Any:
+    """Returns `tf2_msgs/msg/TFMessage` of planar poses (n, 3) [x (m), y (m), theta (rad)]."""
+    stamped = message_class("geometry_msgs/msg/TransformStamped")
+    transform = message_class("geometry_msgs/msg/Transform")
+    vector = message_class("geometry_msgs/msg/Vector3")
+    quaternion = message_class("geometry_msgs/msg/Quaternion")
+    transforms = []
+    for child, pose in zip(child_frame_ids, poses, strict=True):
+        x, y, qz, qw = planar_fields(pose)
+        motion = transform(vector(x, y, 0.0), quaternion(0.0, 0.0, qz, qw))
+        transforms.append(stamped(header(stamp, frame_id), child, motion))
+    return message_class("tf2_msgs/msg/TFMessage")(transforms)
 
 
 def transforms_from_ros(message: Any) -> list[FrameTransform]:
@@ -258,12 +284,10 @@ def _pose(pose: RigidTransform) -> Any:
 
 
 def _planar_pose(pose: Array) -> Any:
-    x, y, theta = np.asarray(pose, float).tolist()
+    x, y, qz, qw = planar_fields(pose)
     return message_class("geometry_msgs/msg/Pose")(
         message_class("geometry_msgs/msg/Point")(x, y, 0.0),
-        message_class("geometry_msgs/msg/Quaternion")(
-            0.0, 0.0, math.sin(theta / 2), math.cos(theta / 2)
-        ),
+        message_class("geometry_msgs/msg/Quaternion")(0.0, 0.0, qz, qw),
     )
 
 

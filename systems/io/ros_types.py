@@ -157,8 +157,8 @@ def seconds(ns: int) -> float:
     return ns / _BILLION  # of two ints: rounded once
 
 
-def time_to_ros(t: float) -> Any:
-    """Returns `builtin_interfaces/msg/Time` of `t` (s).
+def sec_and_nanosec(t: float) -> tuple[int, int]:
+    """Returns the two fields of a `builtin_interfaces/msg/Time` of `t` (s).
 
     Raises:
         ValueError: `t` is not finite or outside of 32 bits of seconds.
@@ -166,7 +166,16 @@ def time_to_ros(t: float) -> Any:
     sec, nanosec = divmod(nanoseconds(t), _BILLION)
     if not -(2**31) <= sec < 2**31:
         raise ValueError(f"time is {t!r}: ROS keeps 32 bits of seconds")
-    return message_class("builtin_interfaces/msg/Time")(sec, nanosec)
+    return sec, nanosec
+
+
+def time_to_ros(t: float) -> Any:
+    """Returns `builtin_interfaces/msg/Time` of `t` (s).
+
+    Raises:
+        ValueError: `t` is not finite or outside of 32 bits of seconds.
+    """
+    return message_class("builtin_interfaces/msg/Time")(*sec_and_nanosec(t))
 
 
 def time_from_ros(time: Any) -> float:
