@@ -25,7 +25,7 @@ from plants.boards import PLATE_THICKNESS
 from plants.circuit_parameters import CircuitParameters
 from systems.markers.family import family
 from systems.markers.layout import Marker, MarkerMap
-from systems.markers.projector import visible_markers
+from systems.markers.visibility import visible_markers
 from systems.noise import generator, stream_key
 from systems.planners.closed_curve import ClosedCurve
 from systems.raycasting import Solids

@@ -10,7 +10,7 @@ from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
 
 from systems.cameras import PinholeCamera
 from systems.markers.family import family
-from systems.markers.projector import ProjectorParameters
+from systems.markers.visibility import ProjectorParameters
 from systems.validation import require, require_non_negative, require_positive
 
 

@@ -67,8 +67,7 @@ def packed(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
     Each other layout, and what is read-only, would be compiled for anew.
     """
-    flags = values.flags
-    if flags.c_contiguous and flags.writeable and values.dtype == np.float64:
+    if values.flags.carray and values.dtype == np.float64:
         return values
     return np.array(values, np.float64, order="C")
 

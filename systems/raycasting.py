@@ -37,6 +37,21 @@ Index = NDArray[np.intp]
 
 # Rounding must not turn away a ray that only just meets what holds a solid.
 _SLACK = 1e-9
+_WORLD = np.eye(3, 4)
+
+SolidArrays = tuple[Array, Array, Array, Index, Index, Array, Index, Index, Array]
+"""Solids for compiled code, where they are a tuple:
+
+(k, 3) centres, m; (k, 3, 3) from the world to the unit shape; (k,) radii of the spheres around the
+centres that hold them, m; then of `systems.solid_shapes`: (k,) kinds, (k,) dimensions of round
+boxes, (k,) ratios of capsules, (k,) where a hull's faces begin and (k,) how many they are, (..., 4)
+the faces of all hulls.
+"""
+SOLID_ARRAYS = (
+    "Tuple((f8[:,::1], f8[:,:,::1], f8[::1], i8[::1], i8[::1], f8[::1], i8[::1], i8[::1],"
+    " f8[:,::1]))"
+)
+"""Numba's signature of it."""
 
 
 class Solids:
@@ -65,7 +80,7 @@ class Solids:
         # World to unit shape, without the shift by the centre.
         self._to_unit = (X[:, :, :3] / scales[:, None, :]).transpose(0, 2, 1).copy()
         counts = np.array([len(solid.faces) for solid in solids], np.intp)
-        # What of a solid does not depend on where it is; see `_cast`.
+        # What of a solid does not depend on where it is; see `SolidArrays`.
         self._shapes = (
             np.array([solid.radius for solid in solids], float) * (1 + _SLACK),
             np.array([solid.kind for solid in solids], np.intp),
@@ -80,17 +95,28 @@ class Solids:
         """Number of solids that can be hit."""
         return len(self._order)
 
+    @property
+    def arrays(self) -> SolidArrays:
+        """The solids for compiled code."""
+        return self._centres, self._to_unit, *self._shapes
+
     def carried(self, X: Array) -> Solids:
         """Returns the same solids, each carried along by a rigid motion of its own.
 
         Args:
             X: (n, 3, 4) rotation and translation, in the order of the constructor's lists.
         """
-        X = X[self._order]
-        R = X[:, :, :3]
+        return self._carried(X, self._order)
+
+    def _carried(self, X: Array, motions: Index) -> Solids:
+        """Returns the solids, each carried along by one of the motions."""
         carried = copy.copy(self)
-        carried._centres = (R @ self._centres[:, :, None])[:, :, 0] + X[:, :, 3]
-        carried._to_unit = self._to_unit @ R.transpose(0, 2, 1)
+        carried._centres = np.empty_like(self._centres)
+        carried._to_unit = np.empty_like(self._to_unit)
+        _carry(
+            self._centres, self._to_unit, in_rows(X, 3, 4), motions,
+            carried._centres, carried._to_unit,
+        )  # fmt: skip
         return carried
 
     def first_hit(
@@ -122,9 +148,9 @@ class Solids:
         n = len(directions)
         distances, entered = np.empty(n), np.empty(n, np.intp)
         reach = np.array(np.broadcast_to(max_range, n), float)
-        _cast(
-            self._centres, self._to_unit, *self._shapes,
-            in_rows(np.asarray(origins), 3), in_rows(directions, 3), reach, distances, entered,
+        cast(
+            self.arrays, in_rows(np.asarray(origins), 3), in_rows(directions, 3), reach,
+            distances, entered,
         )  # fmt: skip
         hit = entered >= 0
         entered[hit] = self._order[entered[hit]]
@@ -144,26 +170,15 @@ class Solids:
         Returns:
             (n,)
         """
-        rays = targets - origin
-        distances = np.sqrt((rays * rays).sum(axis=1))
-        directions = rays / np.maximum(distances, TINY)[:, None]
-        return np.isfinite(self.first_hit(origin, directions, distances - tolerance))
+        hidden = np.empty(len(targets), bool)
+        allowed = np.array(tolerance, float)
+        occlude(self.arrays, in_rows(origin, 3), in_rows(targets, 3), allowed.reshape(-1), hidden)
+        return hidden
 
 
-@compiled(
-    "void(f8[:,::1], f8[:,:,::1], f8[::1], i8[::1], i8[::1], f8[::1], i8[::1], i8[::1],"
-    " f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8[::1])"
-)
-def _cast(
-    centres: Array,
-    to_unit: Array,
-    radii: Array,
-    kinds: Index,
-    dimensions: Index,
-    ratios: Array,
-    starts: Index,
-    counts: Index,
-    faces: Array,
+@compiled(f"void({SOLID_ARRAYS}, f8[:,::1], f8[:,::1], f8[::1], f8[::1], i8[::1])")
+def cast(
+    solids: SolidArrays,
     origins: Array,
     directions: Array,
     reach: Array,
@@ -173,21 +188,14 @@ def _cast(
     """Writes how far n rays get and which of k solids they enter then: inf and -1 for none.
 
     Args:
-        centres: (k, 3) of the solids, m.
-        to_unit: (k, 3, 3) from the world to the unit shape.
-        radii: (k,) of the spheres around the centres that hold them, m.
-        kinds: (k,) of `systems.solid_shapes`, as the next two.
-        dimensions: (k,) of round boxes.
-        ratios: (k,) of capsules.
-        starts: (k,) where a hull's faces begin.
-        counts: (k,) how many they are.
-        faces: (..., 4) of all hulls.
+        solids: see `Solids.arrays`.
         origins: (n or 1, 3) m.
         directions: (n, 3).
         reach: (n,) m.
         distances: (n,) written, m.
         entered: (n,) written.
     """
+    centres, to_unit, radii, kinds, dimensions, ratios, starts, counts, faces = solids
     c, o, d = np.empty(3), np.empty(3), np.empty(3)
     for r in range(len(directions)):
         start = 0 if len(origins) == 1 else r
@@ -222,6 +230,63 @@ def _cast(
         distances[r], entered[r] = nearest, first
 
 
+@compiled(f"void({SOLID_ARRAYS}, f8[:,::1], f8[:,::1], f8[::1], b1[::1])")
+def occlude(
+    solids: SolidArrays,
+    origin: Array,
+    targets: Array,
+    tolerance: Array,
+    hidden: NDArray[np.bool_],
+) -> None:
+    """Writes which targets solids hide from the origin, see `Solids.occluded`.
+
+    Args:
+        solids: see `Solids.arrays`.
+        origin: (1, 3) m.
+        targets: (n, 3) m.
+        tolerance: (n or 1,) m.
+        hidden: (n,) written.
+    """
+    n = len(targets)
+    directions, reach = np.empty((n, 3)), np.empty(n)
+    distances, entered = np.empty(n), np.empty(n, np.intp)
+    for k in range(n):
+        square = 0.0
+        for i in range(3):
+            directions[k, i] = targets[k, i] - origin[0, i]
+            square += directions[k, i] * directions[k, i]
+        distance = math.sqrt(square)
+        for i in range(3):
+            directions[k, i] /= max(distance, TINY)
+        reach[k] = distance - tolerance[k if len(tolerance) > 1 else 0]
+    cast(solids, origin, directions, reach, distances, entered)
+    for k in range(n):
+        hidden[k] = entered[k] >= 0
+
+
+@compiled("void(f8[:,::1], f8[:,:,::1], f8[:,:,::1], i8[::1], f8[:,::1], f8[:,:,::1])")
+def _carry(
+    centres: Array,
+    to_unit: Array,
+    X: Array,
+    motions: Index,
+    carried_centres: Array,
+    carried_to_unit: Array,
+) -> None:
+    """Writes where solids (see `SolidArrays`) are after one of the motions (..., 3, 4) each."""
+    for s in range(len(centres)):
+        m = motions[s]
+        for i in range(3):
+            place = X[m, i, 3]
+            for j in range(3):
+                place += X[m, i, j] * centres[s, j]
+                turned = 0.0
+                for k in range(3):
+                    turned += to_unit[s, i, k] * X[m, j, k]
+                carried_to_unit[s, i, j] = turned
+            carried_centres[s, i] = place
+
+
 class SceneSolids:
     """The solids of a SceneGraph in the frames that carry them, ready to be posed. Immutable.
 
@@ -233,7 +298,7 @@ class SceneSolids:
     ) -> None:
         self._solids = solids
         self._frames = frames
-        self._frame_of_solid = frame_of_solid
+        self._motions = frame_of_solid[solids._order]
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         return self
@@ -242,15 +307,20 @@ class SceneSolids:
         """Returns the solids in the world, as they stand now."""
         if not self._frames:
             return self._solids
-        X_WF = frame_poses(query_object, self._frames)
-        anchored = np.eye(3, 4)[None]
-        return self._solids.carried(np.concatenate([anchored, X_WF])[self._frame_of_solid])
+        return self._solids._carried(frame_poses(query_object, self._frames), self._motions)
 
 
 def frame_poses(query_object: QueryObject, frames: Sequence[FrameId]) -> Array:
-    """Returns the poses X_WF of the frames: (n, 3, 4), rotation and translation (m)."""
-    poses = [query_object.GetPoseInWorld(frame).GetAsMatrix34() for frame in frames]
-    return np.array(poses).reshape(-1, 3, 4)
+    """Returns the poses of the world, then of the frames, in it.
+
+    Returns:
+        (1 + n, 3, 4) rotations and translations (m).
+    """
+    poses = np.empty((1 + len(frames), 3, 4))
+    poses[0] = _WORLD
+    for k, frame in enumerate(frames):
+        poses[k + 1] = query_object.GetPoseInWorld(frame).GetAsMatrix34()
+    return poses
 
 
 def solids_from_inspector(

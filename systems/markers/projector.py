@@ -7,7 +7,6 @@ than rendering a picture and searching it: 40 to 80 times at 640x480 pixels and 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -15,227 +14,22 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.geometry import FrameId, QueryObject, Role
+from pydrake.geometry import FrameId, QueryObject, Role, SceneGraph
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, OutputPort
 
 from systems.cameras import PinholeCamera
-from systems.compiled import compiled, in_rows, packed
-from systems.markers.corner_noise import corner_deviation, narrow_side_of
+from systems.markers.corner_noise import corner_deviation
 from systems.markers.family import Family
-from systems.markers.layout import MarkerMap, marker_corners
+from systems.markers.layout import MarkerMap
+from systems.markers.visibility import ProjectorParameters, visible_markers
 from systems.messages import Detections
 from systems.noise import NoiseStream
-from systems.plumb_bob import distort
 from systems.raycasting import Solids, SolidsMemo, frame_poses
 from systems.sensors.sampled import SampledSensor
-from systems.validation import require, require_non_negative, require_positive
+from systems.validation import require_positive
 
 Array = NDArray[np.float64]
-
-# A solid this close before a marker is the board that carries it, and hides nothing: metres, or
-# part of the distance from the camera, whichever is more.
-_BOARD = 1e-3
-_BOARD_PART = 0.005
-# Corners, centre, and corners again, to become those of the white margin.
-_OUTLINE = np.concatenate([marker_corners(1.0), np.zeros((1, 3)), marker_corners(1.0)])
-
-
-@dataclass
-class ProjectorParameters:
-    """When a marker is found, and how well.
-
-    The defaults of `min_side_px` and `max_incidence` are where OpenCV and AprilTag 3 began to miss
-    about half of the markers of families DICT_4X4_50 and tag36h11 in synthetic pictures (blur
-    0.6 px, noise 2 grey levels): at a narrow side of 10 to 14 px, whatever the tilt, and beyond 80
-    degrees of tilt at 80 px.
-
-    Attributes:
-        pixel_noise: standard deviation of each corner coordinate of a large marker, px.
-        pixel_noise_by_side: more noise of small ones, px^2 (see `systems.markers.corner_noise`).
-        min_side_px: the narrow side below which a marker is not found, px (see
-            `narrow_side`).
-        max_incidence: angle between the marker's normal and the line of sight beyond which it is
-            not found, rad, below pi/2.
-        max_range: distance beyond which it is not found, m.
-        miss_probability: part of the visible markers that is missed at random.
-        white_margin: how much of the white rim must be in the picture, cells.
-        border_px: how far inside the picture the rim must stay, px.
-    """
-
-    pixel_noise: float = 0.3
-    pixel_noise_by_side: float = 0.0
-    min_side_px: float = 12.0
-    max_incidence: float = 1.4
-    max_range: float = math.inf
-    miss_probability: float = 0.0
-    white_margin: float = 1.0
-    border_px: float = 0.0
-
-    def __post_init__(self) -> None:
-        require_non_negative(
-            pixel_noise=self.pixel_noise,
-            pixel_noise_by_side=self.pixel_noise_by_side,
-            min_side_px=self.min_side_px,
-            white_margin=self.white_margin,
-            border_px=self.border_px,
-        )
-        require(self.max_range > 0, "max_range", self.max_range, "greater than 0")
-        require(
-            0 < self.max_incidence < np.pi / 2,
-            "max_incidence",
-            self.max_incidence,
-            "between 0 and pi/2 (rad)",
-        )
-        require(
-            0 <= self.miss_probability <= 1, "miss_probability", self.miss_probability, "0 to 1"
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class VisibleMarkers:
-    """The markers that can be seen, without noise.
-
-    Attributes:
-        index: (m,) which of the markers.
-        corners: (m, 4, 2) px, as the distorted picture shows them.
-        side: (m,) narrow side, px.
-        incidence: (m,) angle between the marker's normal and the line of sight, rad.
-    """
-
-    index: NDArray[np.intp]
-    corners: Array
-    side: Array
-    incidence: Array
-
-
-def visible_markers(
-    *,
-    camera: PinholeCamera,
-    X_WC: RigidTransform,
-    X_WM: Array,
-    sizes: Array,
-    cells: int,
-    parameters: ProjectorParameters,
-    solids: Solids | None = None,
-) -> VisibleMarkers:
-    """Projects the markers that a detector could find.
-
-    A marker is visible when the camera is on its printed side, within the range and the incidence;
-    its corners and its white margin are before the camera and in the picture; its narrow side is
-    large enough; and no solid hides its corners or its centre.
-
-    Args:
-        camera: intrinsics.
-        X_WC: pose of the optical frame.
-        X_WM: (n, 3, 4) rotations and translations (m) of the markers.
-        sizes: (n,) sides of the black squares, m.
-        cells: cells along a side of the black square.
-        parameters: limits.
-        solids: what may stand before the markers.
-    """
-    n, p, pose = len(sizes), parameters, in_rows(X_WC.GetAsMatrix34(), 4)
-    outline = _OUTLINE.copy()
-    outline[5:] *= 1 + 2 * p.white_margin / cells
-    keep, p_WQ, pixels = np.empty(n, bool), np.empty((n, 5, 3)), np.empty((n, 4, 2))
-    side, distance, cosine = np.empty(n), np.empty(n), np.empty(n)
-    limits = np.array(
-        (
-            camera.width, camera.height, camera.fold_radius, math.cos(p.max_incidence),
-            p.max_range, p.min_side_px, p.border_px,
-        )
-    )  # fmt: skip
-    _outlines(
-        pose, in_rows(X_WM, 3, 4), packed(sizes), outline, *camera.matrices, limits,
-        keep, p_WQ, pixels, side, distance, cosine,
-    )  # fmt: skip
-    if solids is not None and keep.any():
-        tolerance = np.maximum(_BOARD, _BOARD_PART * distance[keep])
-        hidden = solids.occluded(pose[:, 3], p_WQ[keep].reshape(-1, 3), np.repeat(tolerance, 5))
-        keep[keep] = ~hidden.reshape(-1, 5).any(axis=1)
-    return VisibleMarkers(np.flatnonzero(keep), pixels[keep], side[keep], np.arccos(cosine[keep]))
-
-
-@compiled(
-    "void(f8[:,::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
-    " b1[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1])"
-)
-def _outlines(
-    X_WC: Array,
-    X_WM: Array,
-    sizes: Array,
-    outline: Array,
-    K: Array,
-    D: Array,
-    limits: Array,
-    keep: NDArray[np.bool_],
-    p_WQ: Array,
-    pixels: Array,
-    side: Array,
-    distance: Array,
-    cosine: Array,
-) -> None:
-    """Projects the markers that are in the picture if nothing hides them.
-
-    Args:
-        X_WC: (3, 4).
-        X_WM: (n, 3, 4).
-        sizes: (n,) m.
-        outline: (9, 3) corners, centre, corners of the margin; of a marker of size 1.
-        K: (3, 3) px.
-        D: (5,).
-        limits: width (px), height (px), radius of the distortion's fold, cosine of the incidence,
-            range (m), narrow side (px), border (px).
-        keep: (n,) written: which are; the rest is written for these.
-        p_WQ: (n, 5, 3) written: corners and centre, m.
-        pixels: (n, 4, 2) written: corners, px.
-        side: (n,) written: narrow side, px.
-        distance: (n,) written, m.
-        cosine: (n,) written: of the incidence.
-    """
-    width, height, fold, least_cosine = limits[0], limits[1], limits[2], limits[3]
-    max_range, min_side, border = limits[4], limits[5], limits[6]
-    low = border - 0.5  # the picture's edge: pixels count from their centres
-    from_camera, p_W = np.empty(3), np.empty(3)
-    for n in range(len(sizes)):
-        keep[n] = False
-        toward, square = 0.0, 0.0
-        for i in range(3):
-            line = X_WC[i, 3] - X_WM[n, i, 3]
-            toward += line * X_WM[n, i, 0]
-            square += line * line
-        far = math.sqrt(square)
-        if not (toward > far * least_cosine and far <= max_range):
-            continue
-        inside = True
-        for q in range(len(outline)):
-            for i in range(3):
-                p_W[i] = X_WM[n, i, 3]
-                for j in range(3):
-                    p_W[i] += X_WM[n, i, j] * outline[q, j] * sizes[n]
-                from_camera[i] = p_W[i] - X_WC[i, 3]
-            x, y, z = 0.0, 0.0, 0.0
-            for i in range(3):
-                x += X_WC[i, 0] * from_camera[i]
-                y += X_WC[i, 1] * from_camera[i]
-                z += X_WC[i, 2] * from_camera[i]
-            if not (z > 0 and math.hypot(x, y) < fold * z):
-                inside = False
-                break
-            bent_x, bent_y, _, _, _ = distort(x / z, y / z, D)
-            u, v = K[0, 0] * bent_x + K[0, 2], K[1, 1] * bent_y + K[1, 2]
-            if u < low or v < low or u > width - 1 - low or v > height - 1 - low:
-                inside = False
-                break
-            if q < 5:
-                p_WQ[n, q, 0], p_WQ[n, q, 1], p_WQ[n, q, 2] = p_W[0], p_W[1], p_W[2]
-            if q < 4:
-                pixels[n, q, 0], pixels[n, q, 1] = u, v
-        if not inside:
-            continue
-        side[n] = narrow_side_of(pixels[n])
-        distance[n], cosine[n] = far, min(toward / far, 1.0)
-        keep[n] = side[n] >= min_side
 
 
 def project_markers(
@@ -384,9 +178,11 @@ class MarkerProjector(SampledSensor):
         self._frame_id = frame_id
         self._ids = np.array([marker.id for marker in markers], np.int64)
         self._sizes = np.array([marker.size for marker in markers], float)
-        self._frames = list(dict.fromkeys(marker.frame for marker in markers))
+        world = SceneGraph.world_frame_id()
+        self._frames = list(dict.fromkeys(m.frame for m in markers if m.frame != world))
+        # The world's comes first, see `frame_poses`.
         self._frame_of_marker = np.array(
-            [self._frames.index(marker.frame) for marker in markers], np.intp
+            [0 if m.frame == world else 1 + self._frames.index(m.frame) for m in markers], np.intp
         )
         self._X_FM = np.array([m.X_FM.GetAsMatrix34() for m in markers]).reshape(-1, 3, 4)
         self._noise = NoiseStream(self, seed=seed, name=name)
@@ -413,13 +209,10 @@ class MarkerProjector(SampledSensor):
 
     def _measure(self, context: Context, stamp: float, index: int) -> Detections:
         query_object: Any = self._query_input.Eval(context)
-        X_WF = frame_poses(query_object, self._frames)[self._frame_of_marker]
-        X_WM = X_WF[:, :, :3] @ self._X_FM
-        X_WM[:, :, 3] += X_WF[:, :, 3]
         found, corners = project_markers(
             camera=self._camera,
             X_WC=query_object.GetPoseInWorld(self._parent_frame) @ self._X_PC,
-            X_WM=X_WM,
+            X_WM=self._marker_poses(query_object),
             sizes=self._sizes,
             cells=self._family.cells,
             parameters=self._parameters,
@@ -435,3 +228,11 @@ class MarkerProjector(SampledSensor):
             hamming=np.zeros(len(found), np.int64),
             decision_margin=np.full(len(found), np.nan),
         )
+
+    def _marker_poses(self, query_object: QueryObject) -> Array:
+        if not self._frames:
+            return self._X_FM
+        X_WF = frame_poses(query_object, self._frames)[self._frame_of_marker]
+        X_WM = X_WF[:, :, :3] @ self._X_FM
+        X_WM[:, :, 3] += X_WF[:, :, 3]
+        return X_WM

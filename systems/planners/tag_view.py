@@ -11,7 +11,7 @@ from pydrake.math import RigidTransform
 from systems.angles import spatial_pose
 from systems.cameras import PinholeCamera
 from systems.markers.layout import MarkerMap
-from systems.markers.projector import ProjectorParameters, visible_markers
+from systems.markers.visibility import ProjectorParameters, visible_markers
 
 Array = NDArray[np.float64]
 

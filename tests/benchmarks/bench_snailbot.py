@@ -28,7 +28,7 @@ from systems.flow.shell import R_DOWN
 from systems.image_effects import ImageEffects, expose
 from systems.markers.detector import MarkerDetector
 from systems.markers.pnp import rotation_from_vector
-from systems.markers.projector import ProjectorParameters, visible_markers
+from systems.markers.visibility import ProjectorParameters, visible_markers
 from systems.shell.angles import rotation
 from systems.shell.layout import SHELL_RADIUS, shell_markers
 from tests.benchmarks.table import Row, show

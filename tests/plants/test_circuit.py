@@ -12,7 +12,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from plants.circuit import Circuit, circuit, in_view, seen_along, tag_poses
 from plants.circuit_parameters import CircuitCamera, CircuitParameters
 from systems.markers.layout import MarkerMap
-from systems.markers.projector import visible_markers
+from systems.markers.visibility import visible_markers
 from systems.planners.closed_curve import ClosedCurve
 from systems.raycasting import Solids
 

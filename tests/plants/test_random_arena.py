@@ -18,7 +18,7 @@ from plants.random_arena import (
     random_arena,
 )
 from systems.cameras import load_camera
-from systems.markers.projector import ProjectorParameters, visible_markers
+from systems.markers.visibility import ProjectorParameters, visible_markers
 from systems.raycasting import Solids
 
 SEEDS = range(12)
