@@ -11,6 +11,8 @@ from systems.compiled import compiled
 
 Array = NDArray[np.float64]
 
+_SMALL = 1e-8  # rad^2; below, the series' next terms round away
+
 
 @compiled()
 def solve_positive(A: Array, b: Array) -> bool:
@@ -99,3 +101,20 @@ def congruence(A: Array, P: Array, product: Array) -> None:
             for k in range(m):
                 total += row[k] * A[j, k]
             product[i, j] = product[j, i] = total
+
+
+@compiled()
+def rotation_of(w: Array, R: Array) -> None:
+    """Writes exp([w]x) (Rodrigues) of a rotation vector w (3,) rad to R (3, 3)."""
+    x, y, z = w[0], w[1], w[2]
+    square = x * x + y * y + z * z
+    if square > _SMALL:
+        angle = math.sqrt(square)
+        half = math.sin(angle / 2) / angle
+        a, b = math.sin(angle) / angle, 2 * half * half
+    else:
+        a, b = 1 - square / 6, 0.5 - square / 24
+    c = 1 - b * square
+    R[0, 0], R[0, 1], R[0, 2] = c + b * x * x, b * x * y - a * z, b * x * z + a * y
+    R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, c + b * y * y, b * y * z - a * x
+    R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, c + b * z * z

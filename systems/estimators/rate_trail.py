@@ -22,7 +22,7 @@ from systems.estimators.shell_model import Turn
 Array = NDArray[np.float64]
 
 # A row: number of the sample; integrals of gyro, reference and time without a gyro; the two rates.
-_INDEX, _SUMS, _RATES = 0, slice(1, 8), slice(8, 14)
+_INDEX = 0
 WIDTH = 14
 _RATE_WINDOW = 0.01  # s, over which a momentary rate is averaged
 
@@ -55,17 +55,7 @@ class RateTrail:
             reference: 3 numbers, rad/s, in another frame.
             lost: whether the gyro is only a guess.
         """
-        n = len(self._rows)
-        index, *before = self._rows[(k - 1) % n].tolist()
-        rates = (*gyro, *reference)
-        if index == k - 1:
-            half, dt = 0.5 / self._rate, 1.0 / self._rate
-            trapezes = [half * (a + b) for a, b in zip(rates, before[7:], strict=True)]
-            sums = [a + b for a, b in zip(before[:7], (*trapezes, lost * dt), strict=True)]
-        else:
-            self._rows[:] = np.nan
-            sums = [0.0] * 7
-        self._rows[k % n] = (k, *sums, *rates)
+        add_row(self._rows, k, np.array(gyro, float), np.array(reference, float), lost, self._rate)
 
     def newest(self) -> int:
         """Returns the number of the last sample."""
@@ -81,27 +71,54 @@ class RateTrail:
             end: s.
             newest: number of the last sample.
         """
-        oldest = self._oldest(newest)
-        sums = np.empty((6, 7))
-        _sums(packed(self._rows), start, end, self._age, self._rate, oldest, newest, sums)
-        turn = (sums[3] - sums[0]).tolist()
-        rates = (sums[2::3, :3] - sums[1::3, :3]) / _RATE_WINDOW
-        begin = oldest / self._rate - self._age
-        known = abs(max(end, begin) - max(start, begin))
-        lost = max(abs(end - start) - known, 0.0)
-        return Turn(
-            np.array(turn[:3]), np.array(turn[3:6]), end - start,
-            rates[0], rates[1], abs(turn[6]) + lost,
-        )  # fmt: skip
-
-    def _oldest(self, newest: int) -> int:
-        n = len(self._rows)
-        k = newest - n + 1
-        full = self._rows[k % n, _INDEX] == k
-        return k if full else int(np.fmin.reduce(self._rows[:, _INDEX]))
+        told = np.empty(13)
+        _turn(packed(self._rows), start, end, self._age, self._rate, newest, told)
+        return Turn(told[:3], told[3:6], end - start, told[6:9], told[9:12], float(told[12]))
 
 
-@compiled("void(f8[:,::1], f8, f8, f8, f8, i8, i8, f8[:,::1])")
+@compiled("void(f8[:,::1], i8, f8[::1], f8[::1], b1, f8)")
+def add_row(rows: Array, k: int, gyro: Array, reference: Array, lost: bool, rate: float) -> None:
+    """Adds the rates of sample k to a trail, see `RateTrail.add`; for compiled code too."""
+    n = len(rows)
+    before, row = rows[(k - 1) % n], rows[k % n]
+    follows = before[0] == k - 1
+    if not follows:
+        rows[:] = np.nan
+    for i in range(7):
+        step = lost / rate
+        if i < 6:
+            now = gyro[i] if i < 3 else reference[i - 3]
+            step = (now + before[8 + i]) * 0.5 / rate
+            row[8 + i] = now
+        row[1 + i] = before[1 + i] + step if follows else 0.0
+    row[0] = k
+
+
+@compiled("void(f8[:,::1], f8, f8, f8, f8, i8, f8[::1])")
+def _turn(
+    rows: Array, start: float, end: float, age: float, rate: float, newest: int, told: Array
+) -> None:
+    """Writes the integrals (6,), the rates at both ends (3,) and the time without a gyro."""
+    n = len(rows)
+    oldest = newest - n + 1
+    if rows[oldest % n, 0] != oldest:  # not full yet
+        oldest = newest
+        for k in range(n):
+            if rows[k, 0] < oldest:
+                oldest = int(rows[k, 0])
+    sums = np.empty((6, 7))
+    _sums(rows, start, end, age, rate, oldest, newest, sums)
+    for i in range(6):
+        told[i] = sums[3, i] - sums[0, i]
+    for i in range(3):
+        told[6 + i] = (sums[2, i] - sums[1, i]) / _RATE_WINDOW
+        told[9 + i] = (sums[5, i] - sums[4, i]) / _RATE_WINDOW
+    begin = oldest / rate - age
+    known = abs(max(end, begin) - max(start, begin))
+    told[12] = abs(sums[3, 6] - sums[0, 6]) + max(abs(end - start) - known, 0.0)
+
+
+@compiled()
 def _sums(
     rows: Array,
     start: float,

@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.estimators.rate_trail import WIDTH, RateTrail, rows_for
+from systems.compiled import compiled, packed
+from systems.estimators.rate_trail import WIDTH, RateTrail, add_row, rows_for
 from systems.estimators.shell_ekf_parameters import ShellEkfParameters
 from systems.estimators.shell_model import (
     BIAS,
@@ -40,7 +41,7 @@ REASONS = (
 )  # fmt: skip
 
 _SAME_TIME = 1e-6  # s
-_IDENTITY = np.eye(3)
+_IDENTITY, _UNUSED = np.eye(3), np.zeros(0)
 _WAIT = 0.1  # s; a marker pose so far ahead of the flow is carried back rather than waited for
 
 # The memory: time of the state, stamps of the last increment and of the last marker pose; then the
@@ -135,32 +136,13 @@ class ShellFusion:
         Returns:
             What was wrong with them.
         """
-        p, numbers = self.parameters, memory.numbers
-        wrong: list[str] = []
-        if math.isnan(numbers[_TIME]):
-            numbers[_TIME] = t
-        turning = [0.0, 0.0, 0.0]
-        if reference is not None:
-            told = reference[:3].tolist()
-            if all(map(math.isfinite, told)):
-                turning = told
-            else:
-                wrong.append("bad_reference")
-        lost = True
-        if sample is not None:
-            values = sample.tolist()
-            changed = values != numbers[_SAMPLE].tolist()
-            unchanged = 0.0 if changed else float(numbers[_UNCHANGED]) + 1.0 / self.rate
-            numbers[_SAMPLE], numbers[_UNCHANGED] = sample, unchanged
-            within = all(abs(rate) <= p.gyro_range for rate in values[:3])
-            lost = not within or unchanged >= p.imu_silence
-            if lost:
-                wrong.append("bad_imu")
-            else:
-                numbers[_RATE] = values[:3]
-        k = sample_index(t, self.rate)
-        self._trail(memory).add(k, numbers[_RATE].tolist(), turning, lost)
-        return wrong
+        p = self.parameters
+        bad_imu, bad_reference = _listen(
+            memory.numbers, memory.trail.reshape(-1, WIDTH), t, sample_index(t, self.rate),
+            self.rate, _UNUSED if sample is None else packed(sample),
+            _UNUSED if reference is None else packed(reference), p.gyro_range, p.imu_silence,
+        )  # fmt: skip
+        return ["bad_reference"] * bad_reference + ["bad_imu"] * bad_imu
 
     def _trail(self, memory: Memory) -> RateTrail:
         return RateTrail(memory.trail.reshape(-1, WIDTH), rate=self.rate, age=self._age)
@@ -342,6 +324,46 @@ class ShellFusion:
         turn = trail.between(start - float(state.x[DELAY]), t, trail.newest())
         # Only the beginning of this interval is uncertain.
         return turn._replace(rate_after=np.zeros(3))
+
+
+@compiled("UniTuple(b1, 2)(f8[::1], f8[:,::1], f8, i8, f8, f8[::1], f8[::1], f8, f8)")
+def _listen(
+    numbers: Array,
+    trail: Array,
+    t: float,
+    k: int,
+    rate: float,
+    sample: Array,
+    reference: Array,
+    gyro_range: float,
+    silence: float,
+) -> tuple[bool, bool]:
+    """Remembers the rates of sample k, see `ShellFusion.listen`.
+
+    Returns:
+        Whether the sample and the reference's velocity were wrong; what is not used is of size 0.
+    """
+    if math.isnan(numbers[_TIME]):
+        numbers[_TIME] = t
+    turning, bad_reference = np.zeros(3), False
+    if len(reference):
+        for i in range(3):
+            bad_reference = bad_reference or not math.isfinite(reference[i])
+        if not bad_reference:
+            turning[:] = reference[:3]
+    lost, told = True, numbers[_SAMPLE]
+    if len(sample):
+        unchanged, within = True, True
+        for i in range(6):
+            unchanged = unchanged and sample[i] == told[i]
+            within = within and (i >= 3 or abs(sample[i]) <= gyro_range)
+            told[i] = sample[i]
+        numbers[_UNCHANGED] = numbers[_UNCHANGED] + 1.0 / rate if unchanged else 0.0
+        lost = not within or numbers[_UNCHANGED] >= silence
+        if not lost:
+            numbers[_RATE] = sample[:3]
+    add_row(trail, k, numbers[_RATE], turning, lost, rate)
+    return lost and len(sample) > 0, bad_reference
 
 
 def _is_new(message: RotationIncrement | PoseEstimate, last_stamp: float) -> bool:

@@ -30,16 +30,21 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
+from systems.compiled import packed
+from systems.estimators import shell_arithmetic
 from systems.flow.shell import ShellView, back_project
 from systems.markers.pnp import cross_matrix
 from systems.shell.angles import nearest_rotation, one_rotation, rotation_vector
 
 Array = NDArray[np.float64]
 
-THETA, BIAS, MOUNTING = slice(0, 3), slice(3, 6), slice(6, 9)
-SCALE, DELAY, ROCK = slice(9, 11), 11, slice(12, 14)
-GYRO, STEP = slice(14, 23), slice(23, 26)
-SIZE = 26  # without markers
+_AT = shell_arithmetic  # where each part begins
+THETA, BIAS, MOUNTING, STEP = (
+    slice(at, at + 3) for at in (_AT.THETA, _AT.BIAS, _AT.MOUNTING, _AT.STEP)
+)
+SCALE, ROCK = (slice(at, at + 2) for at in (_AT.SCALE, _AT.ROCK))
+GYRO, DELAY = slice(_AT.GYRO, _AT.GYRO + 9), _AT.DELAY
+SIZE = _AT.SIZE  # without markers
 
 _GRID = (16, 12)  # pixels by which the camera's tilt is weighed
 _SMALL = 1e-5  # rad, step of a difference quotient
@@ -47,8 +52,7 @@ _IDENTITY = np.eye(3)
 _IN_PLANE = _IDENTITY[:, :2]
 _Z = np.array([0.0, 0.0, 1.0])
 _BY_ROCK = cross_matrix(_Z)[:, :2]  # of the normal, in B
-_ROWS = np.arange(3)[:, None]
-_BY_SCALE = np.arange(SIZE)[GYRO].reshape(3, 3)  # the columns of each row's scales
+_NO_WAY = np.zeros(3)
 
 
 def marker_slice(k: int) -> slice:
@@ -177,71 +181,38 @@ class ShellModel:
         self.reach = view.radius + height
         self.arm = view.parameters.camera_height - height  # of the camera over the body's origin
         self.noise = noise
-        self._T, by_turn = tilt_sensitivity(view)
+        T, by_turn = tilt_sensitivity(view)
+        self._T = packed(T)
         # Rocking about the body's origin carries the camera over the shell, by this part of the
         # angle, and turns it by the rest.
         carried = self.arm / (self.reach + self.arm)
         self._rock_tilt = (1 - carried) * _IN_PLANE
         self._rock_step = (1 - carried) * (by_turn - np.eye(3)) @ _IN_PLANE
-        self._T_of_way = np.ascontiguousarray(self._T.transpose(0, 2, 1))
-        # What stays the same of the derivatives by noise.
-        self._G = np.zeros((SIZE, 8))
-        self._G[STEP, :3] = np.eye(3)
-        self._G[STEP, 3:5] = self._rock_step
-        self._G[ROCK, 3:5] = np.eye(2)
-        self._G[BIAS, 5:] = np.eye(3)
 
     def turned(self, state: State, turn: Turn) -> Array:
         """Returns the body's rotation over the shell during an interval, (3,) rad, in B."""
-        measured, relative, factor = self._parts(state, turn)
-        u: Array = measured + state.x[GYRO].reshape(3, 3) @ factor - relative
+        u, factor = np.empty((2, 3))
+        way = _NO_WAY if turn.way is None else packed(turn.way)
+        shell_arithmetic.turned(
+            packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
+            way, turn.way is not None, u, factor,
+        )  # fmt: skip
         return u
-
-    def _parts(self, state: State, turn: Turn) -> tuple[Array, Array, Array]:
-        """Returns what the gyro tells, what of it is the reference's, and what scales multiply."""
-        measured = turn.gyro - turn.dt * state.x[BIAS]
-        relative = np.zeros(3)
-        if turn.reference.any():
-            # Of the middle of the interval: seen from the body, the reference's axis turns
-            # meanwhile.
-            in_B = state.R.T @ turn.reference
-            relative = one_rotation((measured - in_B) / 2).T @ in_B
-        return measured, relative, measured if turn.way is None else turn.way + relative
-
-    def step(self, state: State, turn: Turn) -> tuple[Array, Array]:
-        """Returns the body's rotation over the shell during an interval, and its derivative.
-
-        Returns:
-            (3,) rad, in B, and (3, SIZE) by the state.
-        """
-        measured, relative, factor = self._parts(state, turn)
-        D = state.x[GYRO].reshape(3, 3)
-        J = np.zeros((3, SIZE))
-        if turn.reference.any():
-            by_theta = state.R.T @ cross_matrix(turn.reference)
-            J[:, THETA] = -by_theta if turn.way is None else D @ by_theta - by_theta
-        J[:, BIAS] = -turn.dt * (_IDENTITY + D if turn.way is None else _IDENTITY)
-        J[_ROWS, _BY_SCALE] = factor
-        J[:, DELAY] = turn.rate_before - turn.rate_after
-        return measured + D @ factor - relative, J
 
     def transition(self, state: State, turn: Turn) -> tuple[Array, Array, Array]:
         """Returns the derivatives of one step.
 
         Returns:
             F: (SIZE, SIZE) by the state. G: (SIZE, 8) by noise of the step (3), of the rock (2) and
-            of the bias (3). The step: (3,) rad.
+            of the bias (3). The step: (3,) rad, the body's rotation over the shell, in B.
         """
-        u, J = self.step(state, turn)
-        middle = state.R @ one_rotation(u / 2)
-        fades = math.exp(-turn.dt / self.noise.rock_time)
-        F = np.eye(SIZE)
-        F[THETA] += middle @ J
-        F[ROCK, ROCK] *= fades
-        F[STEP] = J
-        F[STEP, ROCK] += (fades - 1) * self._rock_step
-        G = self._G.copy()
-        G[THETA, :3] = middle
+        F, G, u = np.empty((SIZE, SIZE)), np.empty((SIZE, 8)), np.empty(3)
+        shell_arithmetic.transition(
+            packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
+            packed(turn.rate_before), packed(turn.rate_after),
+            _NO_WAY if turn.way is None else packed(turn.way), turn.way is not None,
+            self._rock_step, self.noise.rock_time, u, F, G,
+        )  # fmt: skip
         return F, G, u
 
     def carried(self, state: State, turn: Turn, u: Array) -> tuple[State, Array]:
@@ -249,10 +220,10 @@ class ShellModel:
 
         Its covariance is left as it was.
         """
-        change = math.expm1(-turn.dt / self.noise.rock_time) * state.x[ROCK]
-        x = state.x.copy()
-        x[ROCK] += change
-        return State(nearest_rotation(state.R @ one_rotation(u)), x, state.P), change
+        R, x, change = np.empty((3, 3)), np.empty_like(state.x), np.empty(2)
+        fading = math.expm1(-turn.dt / self.noise.rock_time)
+        shell_arithmetic.carry(packed(state.R), packed(state.x), u, fading, R, x, change)
+        return State(R, x, state.P), change
 
     def predict(self, state: State, turn: Turn) -> tuple[State, Array, Array]:
         """Carries the state to the end of an interval by the gyro.
@@ -261,21 +232,16 @@ class ShellModel:
             The state, the step (3,) that the body has made, and what the flow is to see of it but
             for its own errors (3,), rad: less the change of the rock.
         """
-        noise, n = self.noise, SIZE
+        noise = self.noise
         F, G, u = self.transition(state, turn)
         step = noise.gyro * turn.dt + noise.lost * turn.lost
         rock = -noise.rock * math.expm1(-2 * turn.dt / noise.rock_time)
         bias = noise.bias * turn.dt
         Q = np.array([step, step, step, rock, rock, bias, bias, bias])
-        # The markers stay where they are, however uncertain.
-        above = F @ state.P[:n]
-        own = above[:, :n] @ F.T + G * Q @ G.T
-        P = state.P.copy()
-        P[:n, :n] = (own + own.T) / 2
-        P[:n, n:] = above[:, n:]
-        P[n:, :n] = above[:, n:].T
+        P = np.array(state.P, order="C")
+        shell_arithmetic.propagate(P, F, G, Q)  # the markers stay where they are
         after, change = self.carried(state, turn, u)
-        return after._replace(P=P), u, u + self._rock_step @ change
+        return State(after.R, after.x, P), u, u + self._rock_step @ change
 
     def flow(self, state: State, way: Array, seen: Array) -> tuple[Array, Array]:
         """Returns the increment that the flow is to tell, and its derivative.
@@ -288,20 +254,11 @@ class ShellModel:
         Returns:
             (3,) rad, in B, and (3, SIZE) by the state.
         """
-        x = state.x
-        along, about = x[SCALE].tolist()
-        scale = np.array([along, along, about])
-        turned = self._T_of_way @ way  # (3, 3): what a tilt does
-        tilt = self._rock_tilt @ x[ROCK]
-        by_tilt = turned - cross_matrix(way)
-        H = np.zeros((3, SIZE))
-        H[:, STEP] = (
-            np.eye(3) + np.diag(scale) + self._T @ (x[MOUNTING] + tilt) + cross_matrix(tilt)
+        expected, H = np.empty(3), np.empty((3, SIZE))
+        shell_arithmetic.expect_flow(
+            packed(state.x), packed(way), packed(seen), self._T, self._rock_tilt, expected, H
         )
-        H[:, MOUNTING] = turned
-        H[:, ROCK] = by_tilt @ self._rock_tilt
-        H[:2, 9], H[2, 10] = way[:2], way[2]
-        return seen + scale * way + turned @ x[MOUNTING] + by_tilt @ tilt, H
+        return expected, H
 
     def place(self, state: State) -> tuple[Array, Array]:
         """Returns where the body's origin is, and its derivative.
@@ -382,18 +339,9 @@ def corrected(state: State, H: Array, y: Array, noise: Array, gate: float) -> Up
         noise: (m, m).
         gate: largest squared Mahalanobis distance that is taken.
     """
-    PH = state.P[:, : H.shape[1]] @ H.T
-    S = H @ PH[: H.shape[1]] + noise
-    S = (S + S.T) / 2
-    solved = np.linalg.solve(S, np.concatenate([y[:, None], PH.T], axis=1))
-    distance = float(y @ solved[:, 0])
-    nis = distance / len(y)
-    if not 0 <= distance <= gate:
-        return Update(state, nis, False)
-    K = solved[:, 1:].T
-    # (I - K H) P (I - K H)' + K noise K', multiplied out: only rank m is changed.
-    P = state.P - K @ PH.T
-    x = state.x + K @ y
-    R = nearest_rotation(one_rotation(x[THETA]) @ state.R)
-    x[THETA] = x[STEP] = 0.0
-    return Update(State(R, x, (P + P.T) / 2), nis, True)
+    R, x, P = (np.empty_like(part, order="C") for part in state)
+    distance = shell_arithmetic.correct(
+        packed(state.R), packed(state.x), packed(state.P), H, y, packed(noise), gate, R, x, P
+    )
+    accepted = 0 <= distance <= gate
+    return Update(State(R, x, P) if accepted else state, distance / len(y), accepted)
