@@ -118,3 +118,46 @@ def rotation_of(w: Array, R: Array) -> None:
     R[0, 0], R[0, 1], R[0, 2] = c + b * x * x, b * x * y - a * z, b * x * z + a * y
     R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, c + b * y * y, b * y * z - a * x
     R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, c + b * z * z
+
+
+@compiled()
+def eigen(A: Array, values: Array, vectors: Array) -> None:
+    """Writes the eigenvalues (n,), in no order, and eigenvectors of a symmetric A (n, n).
+
+    By Jacobi's rotations, to rounding error; A is spoilt.
+
+    Args:
+        A: changed.
+        values: written.
+        vectors: (n, n), written; the columns.
+    """
+    n = len(A)
+    vectors[:] = 0.0
+    for i in range(n):
+        vectors[i, i] = 1.0
+    for _ in range(30):  # six do
+        rest, size = 0.0, 0.0
+        for i in range(n):
+            size += A[i, i] * A[i, i]
+            for j in range(i):
+                rest += A[i, j] * A[i, j]
+        if not rest > 1e-34 * size:
+            break
+        for i in range(1, n):
+            for j in range(i):
+                if A[i, j] == 0.0:
+                    continue
+                half = (A[j, j] - A[i, i]) / (2 * A[i, j])
+                t = math.copysign(1.0, half) / (abs(half) + math.hypot(half, 1.0))
+                c = 1 / math.hypot(t, 1.0)
+                s = t * c
+                for k in range(n):
+                    a, b = A[k, i], A[k, j]
+                    A[k, i], A[k, j] = c * a - s * b, s * a + c * b
+                for k in range(n):
+                    a, b = A[i, k], A[j, k]
+                    A[i, k], A[j, k] = c * a - s * b, s * a + c * b
+                    a, b = vectors[k, i], vectors[k, j]
+                    vectors[k, i], vectors[k, j] = c * a - s * b, s * a + c * b
+    for i in range(n):
+        values[i] = A[i, i]

@@ -31,6 +31,7 @@ from systems.markers.layout import MarkerMap
 from systems.messages import PoseEstimate, RotationIncrement
 from systems.noise import sample_index
 from systems.shell.angles import one_rotation, rotation_vector
+from systems.small_matrices import eigen
 
 Array = NDArray[np.float64]
 
@@ -372,7 +373,23 @@ def _is_new(message: RotationIncrement | PoseEstimate, last_stamp: float) -> boo
 
 def _is_covariance(P: Array) -> bool:
     """Whether a matrix is finite, symmetric and not negative, and not all zeros."""
-    if not (np.isfinite(P).all() and P.any()):
+    return _has_sound_eigenvalues(np.array(P, order="C"))
+
+
+@compiled("b1(f8[:,::1])")
+def _has_sound_eigenvalues(P: Array) -> bool:
+    """The same of a matrix that may be spoilt."""
+    n, largest, askew = len(P), 0.0, 0.0
+    for i in range(n):
+        for j in range(n):
+            if not math.isfinite(P[i, j]):
+                return False
+            largest = max(largest, abs(P[i, j]))
+        for j in range(i):
+            askew = max(askew, abs(P[i, j] - P[j, i]))
+            P[i, j] = P[j, i] = (P[i, j] + P[j, i]) / 2
+    if largest == 0.0:
         return False
-    least, *_, most = np.linalg.eigvalsh((P + P.T) / 2).tolist()
-    return bool(least >= -1e-9 * most and np.abs(P - P.T).max() <= 1e-6 * most)
+    values, vectors = np.empty(n), np.empty((n, n))
+    eigen(P, values, vectors)
+    return values.min() >= -1e-9 * values.max() and askew <= 1e-6 * values.max()

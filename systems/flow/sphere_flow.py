@@ -16,22 +16,19 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
+from systems.compiled import packed
+from systems.flow.rotation_fit import nearest_turn, refine_turn
 from systems.flow.shell import ShellView
 from systems.health import Counts
 from systems.memo import Memo
 from systems.messages import PointMatches, RotationIncrement
 from systems.noise import generator, stream_key
-from systems.shell.angles import one_rotation, rotation_vector
+from systems.shell.angles import rotation_vector
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
 
 REASONS = ("bad_matches", "bad_point", "few_points", "no_agreement")
-# Of the information about the three axes, least over most: points within a few hundredths of a
-# pixel do not tell a turn.
-_LEAST_SPREAD = 1e-10
-_STEPS = 3  # of Newton's method at most
-_SETTLED = 1e-8  # rad, a step after which no other is worth its time: less than 1e-4 px
 _NEARLY_ALL = 0.9  # part of the points that makes a search among pairs needless
 _STREAM = stream_key(0, "samples of sphere flow")
 
@@ -83,22 +80,6 @@ class SphereFit:
     dropped: dict[str, int]
 
 
-def kabsch(before: Array, after: Array) -> Array:
-    """Returns the rotation (3, 3) with `after` nearest to `before` turned by it.
-
-    Args:
-        before: (n, 3).
-        after: (n, 3).
-
-    Source: Kabsch, "A solution for the best rotation to relate two sets of vectors", 1976.
-    """
-    U, _, Vt = np.linalg.svd(after.T @ before)
-    R: Array = U @ Vt
-    if np.linalg.det(R) < 0:
-        R -= 2 * np.outer(U[:, 2], Vt[2])
-    return R
-
-
 def pair_rotations(before: Array, after: Array) -> Array:
     """Returns the rotations (b, 3, 3) that carry pairs of directions to others, best in the middle.
 
@@ -120,17 +101,6 @@ def pair_rotations(before: Array, after: Array) -> Array:
     return R
 
 
-def _pixels_and_jacobian(view: ShellView, points: Array) -> tuple[Array, Array]:
-    """Projects points (n, 3) of S, and differentiates by a small turn of the body: (n, 2, 3)."""
-    R_SC = view.X_SC.rotation().matrix()
-    pixels, by_point = view.camera.project_with_jacobian((points - view.X_SC.translation()) @ R_SC)
-    # A turn d of the body moves a point of the shell by -d x p = p x d, and g . (p x d) is
-    # (g x p) . d.
-    gx, gy, gz = (by_point.reshape(-1, 3) @ R_SC.T).reshape(-1, 2, 3).transpose(2, 0, 1)
-    px, py, pz = points.T[:, :, None]
-    return pixels, np.stack([gy * pz - gz * py, gz * px - gx * pz, gx * py - gy * px], axis=-1)
-
-
 class SphereFlowEstimator:
     """Finds the rotation of a body over a shell from matched points.
 
@@ -150,6 +120,8 @@ class SphereFlowEstimator:
         self.view = view
         self.parameters = parameters or SphereFlowParameters()
         self.body_frame = body_frame
+        X_SC = view.X_SC
+        self._X_SC = packed(X_SC.rotation().matrix()), packed(X_SC.translation())
 
     def fit(self, matches: PointMatches) -> SphereFit:
         """Fits one rotation to the matches of two pictures.
@@ -181,28 +153,16 @@ class SphereFlowEstimator:
             dropped["no_agreement"] = 1
             return SphereFit(nothing, dropped)
         if not inliers.all():
-            R_B2B1 = kabsch(before[inliers], after[inliers])
-        for _ in range(_STEPS):
-            turned = before @ R_B2B1.T
-            predicted, jacobian = _pixels_and_jacobian(self.view, turned)
-            error = pixels - predicted
-            inliers = (error * error).sum(axis=1) < p.inlier_px**2
-            if inliers.sum() < enough:
-                dropped["no_agreement"] = 1
-                return SphereFit(nothing, dropped)
-            J, e = jacobian[inliers].reshape(-1, 3), error[inliers].ravel()
-            spread, axes = np.linalg.eigh(J.T @ J)  # of the information
-            if spread[0] < _LEAST_SPREAD * spread[2]:
-                dropped["no_agreement"] = 1
-                return SphereFit(nothing, dropped)
-            inverse = axes / spread @ axes.T
-            step = inverse @ (J.T @ e)
-            R_B2B1 = one_rotation(-step) @ R_B2B1
-            if step @ step < _SETTLED**2:
-                break
-        rest = e - J @ step
-        variance = max(p.pixel_noise**2, float(rest @ rest) / (len(rest) - 3))
-        count = int(inliers.sum())
+            R_B2B1 = nearest_turn(before[inliers], after[inliers])
+        inverse = np.empty((3, 3))
+        count, squares = refine_turn(
+            packed(before), packed(pixels), *self.view.camera.matrices, *self._X_SC,
+            p.inlier_px, enough, R_B2B1, inverse,
+        )  # fmt: skip
+        if count == 0:
+            dropped["no_agreement"] = 1
+            return SphereFit(nothing, dropped)
+        variance = max(p.pixel_noise**2, squares / (2 * count - 3))
         increment = RotationIncrement(
             stamp=matches.stamp,
             previous_stamp=matches.previous_stamp,
@@ -228,7 +188,7 @@ class SphereFlowEstimator:
         limit = 2 * p.inlier_px * view.parameters.camera_height / focal
         # |R a - b|^2 = 2 (r^2 - b'R a).
         least = view.radius**2 - limit**2 / 2
-        R_all = kabsch(before, after)
+        R_all = nearest_turn(before, after)
         together = ((before @ R_all.T) * after).sum(axis=1) > least
         if together.sum() >= _NEARLY_ALL * len(together):
             return together, R_all

@@ -10,7 +10,14 @@ import pytest
 import systems
 from systems import compiled as module
 from systems.compiled import compiled, in_rows, packed, prepare
-from systems.small_matrices import congruence, multiply, solve_positive, turn
+from systems.small_matrices import (
+    congruence,
+    eigen,
+    multiply,
+    rotation_of,
+    solve_positive,
+    turn,
+)
 
 
 @compiled("f8(f8[::1], i8)")
@@ -88,6 +95,29 @@ def test_a_turn_is_that_of_the_exponential_series() -> None:
         turned = np.empty((3, 3))
         turn(w, R, turned)
         np.testing.assert_allclose(turned, series @ R, atol=1e-14)
+
+
+def test_a_rotation_of_a_vector_turns_as_a_turn_does() -> None:
+    rng = np.random.default_rng(4)
+    for size in (0.0, 1e-9, 1e-4, 0.3, 3.0):
+        w = size * rng.normal(size=3)
+        R, turned = np.empty((2, 3, 3))
+        rotation_of(w, R)
+        turn(w, np.eye(3), turned)
+        np.testing.assert_allclose(R, turned, atol=1e-15)
+
+
+@pytest.mark.parametrize("n", [1, 3, 4, 6])
+def test_eigenvalues_and_eigenvectors_make_up_the_matrix(n: int) -> None:
+    rng = np.random.default_rng(n)
+    for scales in (np.ones(n), 10.0 ** -np.arange(0, 2 * n, 2), np.r_[np.ones(n - 1), 0.0]):
+        A = scales[:, None] * rng.normal(size=(n, n))
+        A = A @ A.T
+        values, vectors = np.empty(n), np.empty((n, n))
+        eigen(A.copy(), values, vectors)
+        np.testing.assert_allclose(np.sort(values), np.linalg.eigvalsh(A), atol=1e-14 * A.max())
+        np.testing.assert_allclose(vectors.T @ vectors, np.eye(n), atol=1e-14)
+        np.testing.assert_allclose(vectors * values @ vectors.T, A, atol=1e-14 * A.max())
 
 
 def test_products_are_those_of_numpy() -> None:

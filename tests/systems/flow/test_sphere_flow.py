@@ -11,12 +11,12 @@ from pydrake.systems.analysis import Simulator
 from systems.cameras import PinholeCamera
 from systems.flow.lucas_kanade import LucasKanadeParameters, corners, track
 from systems.flow.mean_flow import surface_velocity
+from systems.flow.rotation_fit import nearest_turn
 from systems.flow.shell import ShellView, ShellViewParameters
 from systems.flow.sphere_flow import (
     SphereFlow,
     SphereFlowEstimator,
     SphereFlowParameters,
-    kabsch,
     pair_rotations,
 )
 from systems.messages import PointMatches
@@ -55,14 +55,14 @@ def matches(
 # --- The parts ---
 
 
-def test_kabsch_gives_the_rotation_and_never_a_reflection() -> None:
+def test_the_nearest_turn_is_the_rotation_and_never_a_reflection() -> None:
     rng = np.random.default_rng(3)
     R = rotation(np.array([0.3, -1.2, 0.7])).matrix()
     p = rng.standard_normal((20, 3))
-    np.testing.assert_allclose(kabsch(p, p @ R.T), R, atol=1e-12)
+    np.testing.assert_allclose(nearest_turn(p, p @ R.T), R, atol=1e-12)
     flat = p * [1, 1, 1e-9]  # on a plane a mirror would fit as well
-    np.testing.assert_allclose(kabsch(flat, flat @ R.T), R, atol=1e-6)
-    assert np.linalg.det(kabsch(p, -p)) == pytest.approx(1.0)
+    np.testing.assert_allclose(nearest_turn(flat, flat @ R.T), R, atol=1e-6)
+    assert np.linalg.det(nearest_turn(p, -p)) == pytest.approx(1.0)
 
 
 def test_a_pair_gives_its_rotation() -> None:
@@ -150,7 +150,7 @@ def test_outliers_are_left_out() -> None:
         assert error @ np.linalg.solve(found.covariance, error) < 25  # 4.3 sigma
     everything = matches(w, noise=0.1, outliers=0.5)
     before, after = (VIEW.back_project(p) for p in (everything.previous, everything.current))
-    plain = rotation_vector(kabsch(before, after).T)
+    plain = rotation_vector(nearest_turn(before, after).T)
     assert np.abs(plain - w).max() > 100 * np.abs(error).max()  # what outliers do to least squares
 
 
