@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -23,6 +24,7 @@ from pydrake.systems.framework import (
 
 from plants.adhesion_margin import Suspension, adhesion_margin
 from plants.shell import ShellParameters
+from systems.compiled import compiled
 from systems.markers.pnp import cross_matrix
 from systems.validation import require, require_non_negative, require_positive
 
@@ -57,6 +59,31 @@ def magnet_force(gap: Any, parameters: MagnetParameters) -> Any:
     together is at contact.
     """
     return parameters.force / (1 + np.maximum(gap, 0.0) / parameters.gap) ** 2
+
+
+@compiled("void(f8[:,::1], f8, f8, f8, f8[:,::1])")
+def _pull(centres: Array, reach: float, force: float, gap: float, F: Array) -> None:
+    """Writes the spatial forces, see `magnet_force`.
+
+    Args:
+        centres: (n + 1, 3) of the wheels, and of the shell, m.
+        reach: distance of a wheel's centre from the shell's when they touch, m.
+        force: at contact, N.
+        gap: at which a quarter of it is left, m.
+        F: (n + 1, 6) zeros; the forces are written, and last their reaction on the shell, N.
+    """
+    last = len(centres) - 1
+    offset = np.empty(3)
+    for k in range(last):
+        square = 0.0
+        for i in range(3):
+            offset[i] = centres[k, i] - centres[last, i]
+            square += offset[i] * offset[i]
+        distance = math.sqrt(square)
+        weaker = 1 + max(distance - reach, 0.0) / gap
+        for i in range(3):
+            F[k, 3 + i] = -force / (weaker * weaker) / distance * offset[i]
+            F[last, 3 + i] -= F[k, 3 + i]
 
 
 class MagneticAdhesion(LeafSystem):
@@ -124,7 +151,8 @@ class MagneticAdhesion(LeafSystem):
         require(len(wheels) >= 3, "wheels", len(wheels), "at least three bodies named ..._wheel")
         self._wheels = [int(index) for index in wheels]
         self._shell = int(plant.GetBodyByName("shell", shell).index())
-        self._pulled = [*wheels, BodyIndex(self._shell)]
+        self._bodies = [*wheels, BodyIndex(self._shell)]
+        self._pulled = [*self._wheels, self._shell]
         self._supports = _supports(plant, wheels)
         # Which wheel bears on which support, and which way its rocker turns.
         self._bearing = np.zeros((len(self._supports), len(wheels)))
@@ -216,23 +244,33 @@ class MagneticAdhesion(LeafSystem):
         """Returns the port that tells whether the robot has come off."""
         return self._detached_output
 
+    def _centres(self, poses: list[RigidTransform]) -> Array:
+        """Returns where the wheels' middles are, and last the shell's centre, (n + 1, 3) m."""
+        return np.array([poses[body].translation() for body in self._pulled])
+
     def _wheels_seen(self, poses: list[RigidTransform]) -> tuple[Array, Array]:
         """Returns where the wheels' middles are from the shell's centre, (n, 3) m, and how far."""
-        centre = poses[self._shell].translation()
-        offsets = np.array([poses[wheel].translation() for wheel in self._wheels]) - centre
+        *wheels, centre = self._centres(poses)
+        offsets = np.array(wheels) - centre
         return offsets, np.sqrt((offsets * offsets).sum(axis=1))
 
     def _gap(self, distances: Array) -> Array:
         return distances - (self._shell_radius + self._wheel_radius)
 
     def _calc_forces(self, context: Context, output: Any) -> None:
-        offsets, distances = self._wheels_seen(self._body_poses_input.Eval(context))
-        pulls = magnet_force(self._gap(distances), self._parameters)
-        vectors = offsets * (-pulls / distances)[:, None]
         F = np.zeros((len(self._pulled), 6))
-        F[:-1, 3:] = vectors
-        F[-1, 3:] = -vectors.sum(axis=0)
-        output.set_value([_at_origin(*pair) for pair in zip(self._pulled, F, strict=True)])
+        magnets = self._parameters
+        _pull(
+            self._centres(self._body_poses_input.Eval(context)),
+            self._shell_radius + self._wheel_radius, magnets.force, magnets.gap, F,
+        )  # fmt: skip
+        forces = []
+        for body, F_W in zip(self._bodies, F, strict=True):
+            force = ExternallyAppliedSpatialForce()
+            force.body_index = body
+            force.F_Bq_W = SpatialForce(F_W)
+            forces.append(force)
+        output.set_value(forces)
 
     def _calc_gaps(self, context: Context, output: Any) -> None:
         output.SetFromVector(self._gap(self._wheels_seen(self._body_poses_input.Eval(context))[1]))
@@ -364,10 +402,3 @@ class JoinForces(LeafSystem):
 
     def _calc_forces(self, context: Context, output: Any) -> None:
         output.set_value([force for port in self._inputs for force in port.Eval(context)])
-
-
-def _at_origin(body: BodyIndex, F_W: Array) -> ExternallyAppliedSpatialForce:
-    applied = ExternallyAppliedSpatialForce()
-    applied.body_index = body
-    applied.F_Bq_W = SpatialForce(F_W)
-    return applied
