@@ -24,7 +24,7 @@ from pydrake.systems.framework import (
     ValueProducer,
 )
 
-from systems.compiled import compiled
+from systems.compiled import compiled, packed
 from systems.noise import NoiseStream
 from systems.validation import require, require_non_negative, require_positive
 
@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 
 _SINES = 12  # for each axis
 _FADE = 0.5  # s
+_NONE = np.zeros(0)
 _SMALL = 1e-2  # rad^2; below, series are more exact than what they are the series of
 
 
@@ -85,37 +86,34 @@ def tilt(waves: Waves, t: float) -> tuple[Array, Array, Array]:
 
     It fades in during the first half second, from rest at zero.
     """
-    q, q_dot, q_ddot = np.empty((3, 2))
-    _sines(waves.rates, waves.weights, t, q, q_dot, q_ddot)
+    q = np.empty((3, 2))
+    _tilt(waves.rates, waves.weights, float(t), q)
+    return q[0], q[1], q[2]
+
+
+@compiled("void(f8[:,::1], c16[:,:,::1], f8, f8[:,::1])")
+def _tilt(rates: Array, weights: NDArray[np.complex128], t: float, q: Array) -> None:
+    """Writes the sums of the waves and of their two derivatives, (3, 2), at t (s)."""
+    q[:] = 0.0
+    for axis in range(2):
+        for k in range(rates.shape[1]):
+            c, s = math.cos(t * rates[axis, k]), math.sin(t * rates[axis, k])
+            for n in range(3):
+                q[n, axis] += weights[n, axis, k].real * s + weights[n, axis, k].imag * c
     s = t / _FADE
     if s >= 1:
-        return q, q_dot, q_ddot
+        return
     # s^3 (10 - 15 s + 6 s^2): its first and second derivative are zero at both ends.
     f = s**3 * (10 - 15 * s + 6 * s * s)
     f_dot = 30 * (s * (1 - s)) ** 2 / _FADE
     f_ddot = 60 * s * (1 - s) * (1 - 2 * s) / _FADE**2
-    return f * q, f_dot * q + f * q_dot, f_ddot * q + 2 * f_dot * q_dot + f * q_ddot
-
-
-@compiled("void(f8[:,::1], c16[:,:,::1], f8, f8[::1], f8[::1], f8[::1])")
-def _sines(
-    rates: Array,
-    weights: NDArray[np.complex128],
-    t: float,
-    q: Array,
-    q_dot: Array,
-    q_ddot: Array,
-) -> None:
-    """Writes the sums of the waves and of their derivatives at t (s), before they fade in."""
     for axis in range(2):
-        q[axis] = q_dot[axis] = q_ddot[axis] = 0.0
-        for k in range(rates.shape[1]):
-            c, s = math.cos(t * rates[axis, k]), math.sin(t * rates[axis, k])
-            q[axis] += weights[0, axis, k].real * s + weights[0, axis, k].imag * c
-            q_dot[axis] += weights[1, axis, k].real * s + weights[1, axis, k].imag * c
-            q_ddot[axis] += weights[2, axis, k].real * s + weights[2, axis, k].imag * c
+        q[2, axis] = f_ddot * q[0, axis] + 2 * f_dot * q[1, axis] + f * q[2, axis]
+        q[1, axis] = f_dot * q[0, axis] + f * q[1, axis]
+        q[0, axis] *= f
 
 
+@compiled()
 def _coefficients(s: float) -> tuple[float, float, float, float, float]:
     """Returns sin(a) / a, b = (1 - cos(a)) / s, c = (a - sin(a)) / (a s), db/ds, dc/ds; s = a^2."""
     if s < _SMALL:
@@ -147,21 +145,59 @@ def tilted(r: Array, r_dot: Array, r_ddot: Array) -> tuple[Array, Array, Array]:
         `R_B0B` (3, 3), the angular velocity (3,) of B in B0 and the angular acceleration (3,), told
         in B0.
     """
-    (x, y), (u, v), (du, dv) = r.tolist(), r_dot.tolist(), r_ddot.tolist()
+    R, turning = np.empty((3, 3)), np.empty((2, 3))
+    _tilted(np.array([r, r_dot, r_ddot]), R, turning)
+    return R, turning[0], turning[1]
+
+
+@compiled("void(f8[:,::1], f8[:,::1], f8[:,::1])")
+def _tilted(q: Array, R: Array, turning: Array) -> None:
+    """Writes the same of a tilt and its derivatives (3, 2): velocity, then acceleration, (2, 3)."""
+    (x, u, du), (y, v, dv) = (q[0, 0], q[1, 0], q[2, 0]), (q[0, 1], q[1, 1], q[2, 1])
     s = x * x + y * y
     a, b, c, b_s, c_s = _coefficients(s)
     k, dk, ds = x * v - y * u, x * dv - y * du, 2 * (x * u + y * v)
     ck, d_ck = c * k, c_s * ds * k + c * dk
-    R = np.array(
-        [
-            [1 - b * y * y, b * x * y, a * y],
-            [b * x * y, 1 - b * x * x, -a * x],
-            [-a * y, a * x, 1 - b * s],
-        ]
-    )
-    w = np.array([u + ck * y, v - ck * x, b * k])
-    alpha = np.array([du + d_ck * y + ck * v, dv - d_ck * x - ck * u, b_s * ds * k + b * dk])
-    return R, w, alpha
+    R[0, 0], R[0, 1], R[0, 2] = 1 - b * y * y, b * x * y, a * y
+    R[1, 0], R[1, 1], R[1, 2] = b * x * y, 1 - b * x * x, -a * x
+    R[2, 0], R[2, 1], R[2, 2] = -a * y, a * x, 1 - b * s
+    turning[0, 0], turning[0, 1], turning[0, 2] = u + ck * y, v - ck * x, b * k
+    turning[1, 0] = du + d_ck * y + ck * v
+    turning[1, 1] = dv - d_ck * x - ck * u
+    turning[1, 2] = b_s * ds * k + b * dk
+
+
+@compiled("void(f8[:,::1], c16[:,:,::1], f8, f8[:,::1], f8[:,::1])")
+def _rock(
+    rates: Array, weights: NDArray[np.complex128], t: float, R: Array, turning: Array
+) -> None:
+    """Writes how the body is turned in the chassis, and turns, at t (s); see `_tilted`."""
+    q = np.empty((3, 2))
+    _tilt(rates, weights, t, q)
+    _tilted(q, R, turning)
+
+
+@compiled("void(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1])")
+def _carry(R: Array, turning: Array, V: Array, velocity: Array, acceleration: Array) -> None:
+    """Adds to what a chassis does what the body on it does beside.
+
+    Args:
+        R: (3, 3) of the chassis in W.
+        turning: (2, 3) of the body, told in the chassis; see `_tilted`.
+        V: (6,) velocity of the chassis in W.
+        velocity: (6,), changed; of size 0 for none.
+        acceleration: (6,), changed; of size 0 for none.
+    """
+    w = np.empty(3)
+    for i in range(3):
+        w[i] = R[i, 0] * turning[0, 0] + R[i, 1] * turning[0, 1] + R[i, 2] * turning[0, 2]
+    for i in range(len(velocity) // 2):
+        velocity[i] += w[i]
+    for i in range(len(acceleration) // 2):
+        a, b = (i + 1) % 3, (i + 2) % 3
+        for j in range(3):
+            acceleration[i] += R[i, j] * turning[1, j]
+        acceleration[i] += V[a] * w[b] - V[b] * w[a]  # what turns with the chassis: Coriolis
 
 
 class RockingBody(LeafSystem):
@@ -294,30 +330,31 @@ class RockingBody(LeafSystem):
 
     def _calc_motion(self, context: Context, output: AbstractValue) -> None:
         (waves,) = self._waves.Eval(context)
-        output.set_value([tilted(*tilt(waves, context.get_time()))])
+        R_B0B, turning = np.empty((3, 3)), np.empty((2, 3))
+        _rock(waves.rates, waves.weights, context.get_time(), R_B0B, turning)
+        output.set_value([R_B0B, turning])
 
     def _calc_pose(self, context: Context, output: AbstractValue) -> None:
         X_WB0: RigidTransform = self._pose_input.Eval(context)
-        R_B0B, _, _ = self._motion.Eval(context)[0]
-        R_WB = RotationMatrix(X_WB0.rotation().matrix() @ R_B0B)
-        output.set_value(RigidTransform(R_WB, X_WB0.translation()))
+        R_B0B, _ = self._motion.Eval(context)
+        output.set_value(X_WB0.multiply(RigidTransform(RotationMatrix(R_B0B))))
 
     def _calc_velocity(self, context: Context, output: Any) -> None:
-        V = self._velocity_input.Eval(context).copy()
-        _, w, _ = self._motion.Eval(context)[0]
-        V[:3] += self._pose_input.Eval(context).rotation().matrix() @ w
-        output.SetFromVector(V)
+        V = packed(self._velocity_input.Eval(context))
+        velocity = V.copy()
+        _carry(*self._turning(context), V, velocity, _NONE)
+        output.SetFromVector(velocity)
 
     def _calc_acceleration(self, context: Context, output: Any) -> None:
-        A = self._acceleration_input.Eval(context).copy()
-        _, w, alpha = self._motion.Eval(context)[0]
-        R_WB0 = self._pose_input.Eval(context).rotation().matrix()
-        x, y, z = self._velocity_input.Eval(context)[:3].tolist()
-        u, v, s = (R_WB0 @ w).tolist()
-        # What turns with the chassis turns: the Coriolis part.
-        A[:3] += R_WB0 @ alpha
-        A[:3] += [y * s - z * v, z * u - x * s, x * v - y * u]
-        output.SetFromVector(A)
+        V = packed(self._velocity_input.Eval(context))
+        acceleration = self._acceleration_input.Eval(context).copy()
+        _carry(*self._turning(context), V, _NONE, acceleration)
+        output.SetFromVector(acceleration)
+
+    def _turning(self, context: Context) -> tuple[Array, Array]:
+        """Returns how the chassis is turned, and how the body on it turns."""
+        _, turning = self._motion.Eval(context)
+        return packed(self._pose_input.Eval(context).rotation().matrix()), turning
 
     def _calc_frame_pose(self, context: Context, output: AbstractValue) -> None:
         poses = FramePoseVector()

@@ -191,11 +191,23 @@ def piece_errors(parameters: ImuParameters, random: np.random.Generator) -> tupl
 
 def digital(sample: Array, limit: Array, bits: int) -> Array:
     """Returns samples (..., 6) as a sensor of that range (6,) tells them, in steps of 2^bits."""
-    if not bits:
-        return np.clip(sample, -limit, limit)
+    told = np.array(sample, float, order="C")
+    _make_digital(told.reshape(-1), packed(limit), bits)
+    return told
+
+
+@compiled("void(f8[::1], f8[::1], i8)")
+def _make_digital(sample: Array, limit: Array, bits: int) -> None:
+    """Changes samples, one after the other."""
     half = 2.0 ** (bits - 1)
-    step = limit / half
-    return np.minimum(np.maximum(np.rint(sample / step), -half), half - 1) * step
+    for k in range(len(sample)):
+        most = limit[k % 6]
+        if bits:
+            step = most / half
+            whole = np.rint(sample[k] / step)
+            sample[k] = np.minimum(np.maximum(whole, -half), half - 1) * step
+        else:
+            sample[k] = np.minimum(np.maximum(sample[k], -most), most)
 
 
 def ideal_sample(X_WB: RigidTransform, V_WB: Array, A_WB: Array, p_BS: Array) -> Array:
@@ -234,9 +246,38 @@ def _ideal_sample(R: Array, V: Array, A: Array, p: Array, sample: Array) -> None
 
 
 @compiled(
-    "void(f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], c16, f8[::1], f8[::1],"
-    " f8[::1], f8[::1], f8[::1])"
+    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], c16,"
+    " f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i8, f8[::1])"
 )
+def _take_sample(
+    R: Array,
+    V: Array,
+    A: Array,
+    p: Array,
+    vibration: Array,
+    matrix: Array,
+    bias: Array,
+    drift: Array,
+    turn: complex,
+    shake_kick: Array,
+    forget: Array,
+    drift_kick: Array,
+    deviation: Array,
+    noise: Array,
+    limit: Array,
+    bits: int,
+    sample: Array,
+) -> None:
+    """Writes what the sensor tells (6,); see `_ideal_sample`, `_add_errors`, `_make_digital`."""
+    _ideal_sample(R, V, A, p, sample)
+    _add_errors(
+        sample, vibration, matrix, bias, drift, turn, shake_kick, forget, drift_kick, deviation,
+        noise,
+    )  # fmt: skip
+    _make_digital(sample, limit, bits)
+
+
+@compiled()
 def _add_errors(
     sample: Array,
     vibration: Array,
@@ -356,7 +397,6 @@ class Imu(LeafSystem):
         # What a sensor does not have costs nothing at each of its samples.
         self._drifts = bool(self._drift_deviation.any())
         self._vibrates = bool(shake.any())
-        self._limited = bool(np.isfinite(self._limit).any())
         self._p_BS = np.zeros(3) if p_BS is None else np.array(p_BS, float)
         sound = self._p_BS.shape == (3,) and bool(np.isfinite(self._p_BS).all())
         require(sound, "p_BS", self._p_BS.tolist(), "three finite numbers (m)")
@@ -402,23 +442,18 @@ class Imu(LeafSystem):
         discrete_state.set_value(self._vibration, vibration)
 
     def _measure(self, context: Context, discrete_state: DiscreteValues) -> None:
-        sample = ideal_sample(
-            self._pose_input.Eval(context),
-            self._velocity_input.Eval(context),
-            self._acceleration_input.Eval(context),
-            self._p_BS,
-        )
         size = 6 + 6 * self._drifts + 12 * self._vibrates
         noise = self._noise.normals(context, sample_index(context.get_time(), self._rate), size)
-        matrix = discrete_state.get_mutable_value(self._matrix).reshape(6, 6)
-        bias = discrete_state.get_mutable_value(self._bias)
         vibration = discrete_state.get_mutable_value(self._vibration)
         drift = discrete_state.get_mutable_value(self._drift)
-        _add_errors(
-            sample,
+        _take_sample(
+            packed(self._pose_input.Eval(context).rotation().matrix()),
+            packed(self._velocity_input.Eval(context)),
+            packed(self._acceleration_input.Eval(context)),
+            self._p_BS,
             vibration if self._vibrates else _NONE,
-            matrix,
-            bias,
+            discrete_state.get_mutable_value(self._matrix).reshape(6, 6),
+            discrete_state.get_mutable_value(self._bias),
             drift if self._drifts else _NONE,
             self._turn,
             self._shake_kick,
@@ -426,7 +461,7 @@ class Imu(LeafSystem):
             self._kick,
             self._deviation,
             packed(noise),
+            self._limit,
+            self._parameters.bits,
+            discrete_state.get_mutable_value(self._sample),
         )
-        if self._limited:
-            sample = digital(sample, self._limit, self._parameters.bits)
-        discrete_state.set_value(self._sample, sample)
