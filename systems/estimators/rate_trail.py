@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 # A row: number of the sample; integrals of gyro, reference and time without a gyro; the two rates.
 _INDEX = 0
 WIDTH = 14
+_UNKNOWN = -1  # for the number of the last sample
 _RATE_WINDOW = 0.01  # s, over which a momentary rate is averaged
 
 
@@ -61,7 +62,7 @@ class RateTrail:
         """Returns the number of the last sample."""
         return int(np.fmax.reduce(self._rows[:, _INDEX]))
 
-    def between(self, start: float, end: float, newest: int) -> Turn:
+    def between(self, start: float, end: float, newest: int | None = None) -> Turn:
         """Returns the turn from one moment to another, which may be earlier.
 
         Before the memory the rate counts as zero and as lost, after it as it was last.
@@ -69,10 +70,18 @@ class RateTrail:
         Args:
             start: s.
             end: s.
-            newest: number of the last sample.
+            newest: number of the last sample, if it is known.
         """
         told = np.empty(13)
-        _turn(packed(self._rows), start, end, self._age, self._rate, newest, told)
+        _turn(
+            packed(self._rows),
+            start,
+            end,
+            self._age,
+            self._rate,
+            _UNKNOWN if newest is None else newest,
+            told,
+        )
         return Turn(told[:3], told[3:6], end - start, told[6:9], told[9:12], float(told[12]))
 
 
@@ -100,6 +109,10 @@ def _turn(
 ) -> None:
     """Writes the integrals (6,), the rates at both ends (3,) and the time without a gyro."""
     n = len(rows)
+    if newest == _UNKNOWN:
+        for k in range(n):
+            if rows[k, 0] > newest:
+                newest = int(rows[k, 0])
     oldest = newest - n + 1
     if rows[oldest % n, 0] != oldest:  # not full yet
         oldest = newest

@@ -1,7 +1,8 @@
 """The arithmetic of `shell_model`, compiled: one call a step or a measurement.
 
 What the symbols mean is said there. Turns of an interval come as their parts: the integrals of gyro
-and reference, the length, the rates at both ends, and the way that the flow tells, if any.
+and reference, the length, the rates at both ends, and the way that the flow tells (of size 0 for
+none).
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _NOISES = 8  # of the step (3), of the rock (2), of the bias (3)
 
 
 @compiled(
-    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8[::1], b1, f8[::1], f8[::1])",
+    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1])",
 )
 def turned(
     R: Array,
@@ -31,7 +32,6 @@ def turned(
     reference: Array,
     dt: float,
     way: Array,
-    has_way: bool,
     u: Array,
     factor: Array,
 ) -> None:
@@ -50,7 +50,7 @@ def turned(
         for i in range(3):
             relative[i] = E[0, i] * in_B[0] + E[1, i] * in_B[1] + E[2, i] * in_B[2]
     for i in range(3):
-        factor[i] = way[i] + relative[i] if has_way else measured[i]
+        factor[i] = way[i] + relative[i] if len(way) else measured[i]
     for i in range(3):
         u[i] = measured[i] - relative[i]
         for j in range(3):
@@ -58,7 +58,7 @@ def turned(
 
 
 @compiled(
-    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1], b1, f8[:,::1], f8,"
+    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1], f8[:,::1], f8,"
     " f8[::1], f8[:,::1], f8[:,::1])",
 )
 def transition(
@@ -70,7 +70,6 @@ def transition(
     rate_before: Array,
     rate_after: Array,
     way: Array,
-    has_way: bool,
     rock_step: Array,
     rock_time: float,
     u: Array,
@@ -80,15 +79,14 @@ def transition(
     """Writes the step (3,) rad and the derivatives of one, as `ShellModel.transition` gives them.
 
     Args:
-        R: (3, 3), as the others up to `has_way` see `turned`.
+        R: (3, 3), as the others up to `dt` see `turned`.
         x: (n,).
         gyro: (3,).
         reference: (3,).
         dt: s.
         rate_before: (3,).
         rate_after: (3,).
-        way: (3,).
-        has_way: whether there is one.
+        way: (3,), or of size 0 for none.
         rock_step: (3, 2) what the flow sees of a change of the rock.
         rock_time: s.
         u: (3,), written.
@@ -96,9 +94,9 @@ def transition(
         G: (SIZE, 8), written.
     """
     factor = np.empty(3)
-    turned(R, x, gyro, reference, dt, way, has_way, u, factor)
+    turned(R, x, gyro, reference, dt, way, u, factor)
     J = np.zeros((3, SIZE))
-    _differentiate_step(R, x, reference, dt, rate_before, rate_after, has_way, factor, J)
+    _differentiate_step(R, x, reference, dt, rate_before, rate_after, len(way) > 0, factor, J)
     half, E, middle = np.empty(3), np.empty((3, 3)), np.empty((3, 3))
     for i in range(3):
         half[i] = u[i] / 2
@@ -181,6 +179,34 @@ def carry(
     for k in range(2):
         change[k] = fading * x[ROCK + k]
         after[ROCK + k] += change[k]
+
+
+@compiled("void(f8[:,::1], f8[::1], f8, f8[::1])")
+def stand(R: Array, x: Array, reach: float, p: Array) -> None:
+    """Writes where the body's origin is (3,) m: `reach` (m) up the normal that it rocks about."""
+    a, b = -x[ROCK + 1], x[ROCK]
+    far = reach / math.sqrt(a * a + b * b + 1)
+    for i in range(3):
+        p[i] = far * (R[i, 0] * a + R[i, 1] * b + R[i, 2])
+
+
+@compiled("void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8, f8, f8[:,::1], f8[::1])")
+def pose_after(
+    R: Array,
+    x: Array,
+    gyro: Array,
+    reference: Array,
+    dt: float,
+    fading: float,
+    reach: float,
+    moved: Array,
+    p: Array,
+) -> None:
+    """Writes rotation (3, 3) and place (3,) m at the end of an interval; see `turned`, `carry`."""
+    u, factor, change, after = np.empty(3), np.empty(3), np.empty(2), np.empty(SIZE)
+    turned(R, x, gyro, reference, dt, np.empty(0), u, factor)
+    carry(R, x[:SIZE], u, fading, moved, after, change)
+    stand(moved, after, reach, p)
 
 
 @compiled("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1])")

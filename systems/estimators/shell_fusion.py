@@ -299,9 +299,9 @@ class ShellFusion:
             (3, 3) `R_RB`; (3,) `p_RB`, m.
         """
         turn = self._turn_ahead(t, state, memory)
-        if turn is not None:
-            state, _ = self.model.carried(state, turn, self.model.turned(state, turn))
-        return state.R, self.model.position(state)
+        if turn is None:
+            return state.R, self.model.position(state)
+        return self.model.pose_after(state, turn)
 
     def covariance(self, t: float, state: State, memory: Memory) -> Array:
         """Returns the covariance (6, 6) of the pose now: rotation, then position.
@@ -321,10 +321,9 @@ class ShellFusion:
         start = float(memory.numbers[_TIME])
         if math.isnan(start):
             return None
-        trail = self._trail(memory)
-        turn = trail.between(start - float(state.x[DELAY]), t, trail.newest())
-        # Only the beginning of this interval is uncertain.
-        return turn._replace(rate_after=np.zeros(3))
+        turn = self._trail(memory).between(start - float(state.x[DELAY]), t)
+        turn.rate_after[:] = 0.0  # only the beginning of this interval is uncertain
+        return turn
 
 
 @compiled("UniTuple(b1, 2)(f8[::1], f8[:,::1], f8, i8, f8, f8[::1], f8[::1], f8, f8)")

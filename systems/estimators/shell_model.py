@@ -52,7 +52,7 @@ _IDENTITY = np.eye(3)
 _IN_PLANE = _IDENTITY[:, :2]
 _Z = np.array([0.0, 0.0, 1.0])
 _BY_ROCK = cross_matrix(_Z)[:, :2]  # of the normal, in B
-_NO_WAY = np.zeros(3)
+_NO_WAY = np.zeros(0)
 
 
 def marker_slice(k: int) -> slice:
@@ -195,7 +195,7 @@ class ShellModel:
         way = _NO_WAY if turn.way is None else packed(turn.way)
         shell_arithmetic.turned(
             packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
-            way, turn.way is not None, u, factor,
+            way, u, factor,
         )  # fmt: skip
         return u
 
@@ -210,7 +210,7 @@ class ShellModel:
         shell_arithmetic.transition(
             packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
             packed(turn.rate_before), packed(turn.rate_after),
-            _NO_WAY if turn.way is None else packed(turn.way), turn.way is not None,
+            _NO_WAY if turn.way is None else packed(turn.way),
             self._rock_step, self.noise.rock_time, u, F, G,
         )  # fmt: skip
         return F, G, u
@@ -274,9 +274,18 @@ class ShellModel:
 
     def position(self, state: State) -> Array:
         """Returns where the body's origin is, (3,) m, in R."""
-        normal = _Z + _BY_ROCK @ state.x[ROCK]
-        p: Array = self.reach / math.sqrt(normal @ normal) * (state.R @ normal)
+        p = np.empty(3)
+        shell_arithmetic.stand(packed(state.R), packed(state.x), self.reach, p)
         return p
+
+    def pose_after(self, state: State, turn: Turn) -> tuple[Array, Array]:
+        """Returns rotation (3, 3) and place (3,) m, in R, at the end of an interval."""
+        R, p = np.empty((3, 3)), np.empty(3)
+        shell_arithmetic.pose_after(
+            packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
+            math.expm1(-turn.dt / self.noise.rock_time), self.reach, R, p,
+        )  # fmt: skip
+        return R, p
 
     def marker_pose(self, state: State, marker: int) -> tuple[Array, Array, Array]:
         """Returns the pose that a picture of a marker is to tell, and its derivative.
