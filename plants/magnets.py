@@ -262,7 +262,7 @@ class MagneticAdhesion(LeafSystem):
         magnets = self._parameters
         _pull(
             self._centres(self._body_poses_input.Eval(context)),
-            self._shell_radius + self._wheel_radius, magnets.force, magnets.gap, F,
+            self._shell_radius + self._wheel_radius, float(magnets.force), float(magnets.gap), F,
         )  # fmt: skip
         forces = []
         for body, F_W in zip(self._bodies, F, strict=True):

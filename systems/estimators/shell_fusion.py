@@ -141,7 +141,8 @@ class ShellFusion:
         bad_imu, bad_reference = _listen(
             memory.numbers, memory.trail.reshape(-1, WIDTH), t, sample_index(t, self.rate),
             self.rate, _UNUSED if sample is None else packed(sample),
-            _UNUSED if reference is None else packed(reference), p.gyro_range, p.imu_silence,
+            _UNUSED if reference is None else packed(reference),
+            float(p.gyro_range), float(p.imu_silence),
         )  # fmt: skip
         return ["bad_reference"] * bad_reference + ["bad_imu"] * bad_imu
 

@@ -350,7 +350,7 @@ def corrected(state: State, H: Array, y: Array, noise: Array, gate: float) -> Up
     """
     R, x, P = (np.empty_like(part, order="C") for part in state)
     distance = shell_arithmetic.correct(
-        packed(state.R), packed(state.x), packed(state.P), H, y, packed(noise), gate, R, x, P
+        packed(state.R), packed(state.x), packed(state.P), H, y, packed(noise), float(gate), R, x, P
     )
     accepted = 0 <= distance <= gate
     return Update(State(R, x, P) if accepted else state, distance / len(y), accepted)

@@ -56,6 +56,23 @@ def _by_quaternion(B: Array, R: Array) -> None:
     R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
 
 
+@compiled("i8(f8[:,::1], f8[:,::1], f8[:,::1], f8, b1[::1])")
+def agreeing(
+    before: Array, after: Array, R: Array, least: float, together: NDArray[np.bool_]
+) -> int:
+    """Writes which points (n, 3) have a product b'R a beyond `least`; returns how many."""
+    count = 0
+    for k in range(len(before)):
+        product = 0.0
+        for i in range(3):
+            product += after[k, i] * (
+                R[i, 0] * before[k, 0] + R[i, 1] * before[k, 1] + R[i, 2] * before[k, 2]
+            )
+        together[k] = product > least
+        count += together[k]
+    return count
+
+
 @compiled(
     "Tuple((i8, f8))(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8, f8,"
     " f8[:,::1], f8[:,::1])"

@@ -17,6 +17,7 @@ from pydrake.math import RigidTransform, RotationMatrix
 from systems.cameras import PinholeCamera
 from systems.compiled import compiled, in_rows, packed
 from systems.markers.pnp import rotation_from_vector
+from systems.plumb_bob import distort, find_rays
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -104,13 +105,70 @@ def project(camera: PinholeCamera, X_SC: RigidTransform, points: Array) -> Array
         (n, 2) px, NaN for points behind the camera, beyond the shell's horizon, or beyond where the
         lens' model holds; pixels may lie outside the picture.
     """
-    line = X_SC.translation() - points
-    p_C = -line @ X_SC.rotation().matrix()
-    seen = ((line * points).sum(axis=1) > 0) & (p_C[:, 2] > 0)
-    seen &= np.hypot(p_C[:, 0], p_C[:, 1]) < camera.fold_radius * p_C[:, 2]
-    pixels = np.full((len(points), 2), np.nan)
-    pixels[seen] = camera.project(p_C[seen])
+    pixels = np.empty((len(points), 2))
+    R, p = packed(X_SC.rotation().matrix()), packed(X_SC.translation())
+    _see(in_rows(points, 3), R, p, *camera.matrices, camera.fold_radius, pixels)
     return pixels
+
+
+@compiled("void(f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8, f8[:,::1])")
+def _see(
+    points: Array, R: Array, p: Array, K: Array, D: Array, fold_radius: float, pixels: Array
+) -> None:
+    """Writes the pixels (n, 2) that show points (n, 3) to a camera at R, p; NaN where none does."""
+    for k in range(len(points)):
+        x, y, z, above = 0.0, 0.0, 0.0, 0.0
+        for i in range(3):
+            line = points[k, i] - p[i]
+            above -= line * points[k, i]
+            x += line * R[i, 0]
+            y += line * R[i, 1]
+            z += line * R[i, 2]
+        if above > 0 and z > 0 and math.hypot(x, y) < fold_radius * z:
+            bent_x, bent_y, _, _, _ = distort(x / z, y / z, D)
+            pixels[k, 0], pixels[k, 1] = K[0, 0] * bent_x + K[0, 2], K[1, 1] * bent_y + K[1, 2]
+        else:
+            pixels[k, 0], pixels[k, 1] = math.nan, math.nan
+
+
+@compiled(
+    "i8(f8[:,::1], f8[:,::1], f8, f8, f8[:,::1], f8[::1], f8, f8[:,::1], f8[::1], f8,"
+    " f8[:,:,::1], f8[:,::1])"
+)
+def _matched(
+    previous: Array,
+    current: Array,
+    width: float,
+    height: float,
+    K: Array,
+    D: Array,
+    fold_radius: float,
+    R: Array,
+    p: Array,
+    radius: float,
+    points: Array,
+    pixels: Array,
+) -> int:
+    """Writes the points (2, n, 3) and the later pixels (n, 2) of matches; returns how many serve.
+
+    Those serve of which both pixels (n, 2) are in the picture and show the shell.
+    """
+    n = len(previous)
+    rays, by_ray, met = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((2, n, 3))
+    find_rays(previous, K, D, fold_radius, rays, by_ray)
+    _meet_sphere(rays, R, p, radius, met[0])
+    find_rays(current, K, D, fold_radius, rays, by_ray)
+    _meet_sphere(rays, R, p, radius, met[1])
+    count = 0
+    for k in range(n):
+        serves = math.isfinite(met[0, k, 0]) and math.isfinite(met[1, k, 0])
+        for i in range(2):
+            most = (height if i else width) - 0.5
+            serves = serves and -0.5 <= previous[k, i] <= most and -0.5 <= current[k, i] <= most
+        if serves:
+            points[:, count], pixels[count] = met[:, k], current[k]
+            count += 1
+    return count
 
 
 class ShellView:
@@ -127,11 +185,32 @@ class ShellView:
         self.camera = camera
         self.parameters = parameters or ShellViewParameters()
         self.radius = self.parameters.radius
-        self.X_SC = looking_down(self.parameters)
+        self.X_SC = X_SC = looking_down(self.parameters)
+        self._place = packed(X_SC.rotation().matrix()), packed(X_SC.translation())
 
     def back_project(self, pixels: Array) -> Array:
         """Returns the points (n, 3) m of the shell, in S, that pixels (n, 2) show; NaN for none."""
         return back_project(self.camera, self.X_SC, self.radius, pixels)
+
+    def matched(self, previous: Array, current: Array) -> tuple[Array, Array, Array]:
+        """Returns the points of the shell that matches show, (n, 3) m in S in each picture.
+
+        Of those only, of which both pixels are in the picture and show the shell.
+
+        Args:
+            previous: (m, 2) px.
+            current: (m, 2) px.
+
+        Returns:
+            The points in the first and in the second picture, and the pixels (n, 2) in the second.
+        """
+        camera, n = self.camera, len(previous)
+        points, pixels = np.empty((2, n, 3)), np.empty((n, 2))
+        count = _matched(
+            packed(previous), packed(current), float(camera.width), float(camera.height),
+            *camera.matrices, camera.fold_radius, *self._place, self.radius, points, pixels,
+        )  # fmt: skip
+        return points[0, :count], points[1, :count], pixels[:count]
 
     def turned(self, pixels: Array, increment: Array) -> Array:
         """Returns where points are seen after the body has turned about the shell's centre.

@@ -17,7 +17,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.compiled import packed
-from systems.flow.rotation_fit import nearest_turn, refine_turn
+from systems.flow.rotation_fit import agreeing, nearest_turn, refine_turn
 from systems.flow.shell import ShellView
 from systems.health import Counts
 from systems.memo import Memo
@@ -136,27 +136,21 @@ class SphereFlowEstimator:
         if not (shapes and math.isfinite(interval) and interval > 0):
             dropped["bad_matches"] = int(not math.isnan(matches.stamp))
             return SphereFit(nothing, dropped)
-        both = np.stack([matches.previous, matches.current])
-        both = both[:, self.view.inside(both).all(axis=0)]
-        points = self.view.back_project(both.reshape(-1, 2)).reshape(*both.shape[:2], 3)
-        on_shell = np.isfinite(points.sum(axis=(0, 2)))
-        if not on_shell.all():
-            points, both = points[:, on_shell], both[:, on_shell]
-        (before, after), pixels = points, both[1]
+        before, after, pixels = self.view.matched(matches.previous, matches.current)
         dropped["bad_point"] = len(matches) - len(pixels)
         if len(before) < p.min_inliers:
             dropped["few_points"] = 1
             return SphereFit(nothing, dropped)
         inliers, R_B2B1 = self._consensus(before, after, matches.stamp)
-        enough = max(p.min_inliers, p.min_inlier_share * len(before))
-        if inliers.sum() < enough:
+        enough = max(float(p.min_inliers), p.min_inlier_share * len(before))
+        if np.count_nonzero(inliers) < enough:
             dropped["no_agreement"] = 1
             return SphereFit(nothing, dropped)
         if not inliers.all():
             R_B2B1 = nearest_turn(before[inliers], after[inliers])
         inverse = np.empty((3, 3))
         count, squares = refine_turn(
-            packed(before), packed(pixels), *self.view.camera.matrices, *self._X_SC,
+            before, pixels, *self.view.camera.matrices, *self._X_SC,
             p.inlier_px, enough, R_B2B1, inverse,
         )  # fmt: skip
         if count == 0:
@@ -189,8 +183,8 @@ class SphereFlowEstimator:
         # |R a - b|^2 = 2 (r^2 - b'R a).
         least = view.radius**2 - limit**2 / 2
         R_all = nearest_turn(before, after)
-        together = ((before @ R_all.T) * after).sum(axis=1) > least
-        if together.sum() >= _NEARLY_ALL * len(together):
+        together = np.empty(len(before), bool)
+        if agreeing(before, after, R_all, least, together) >= _NEARLY_ALL * len(before):
             return together, R_all
         n = len(before)
         random = generator(_STREAM, round(abs(stamp) * 1e9))
