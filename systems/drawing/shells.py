@@ -16,9 +16,11 @@ from pydrake.geometry import FrameId
 from pydrake.math import RigidTransform
 
 from systems.cameras import PinholeCamera
+from systems.compiled import in_rows, packed
 from systems.drawing.boards import Sheet, marker_sheet, on_the_face
 from systems.drawing.coverage import Box, Edges, outlines
-from systems.drawing.layers import NEAREST, Drawing, Layer, box_of, projected_edges
+from systems.drawing.layers import Drawing, Layer, box_of, projected_edges
+from systems.drawing.shell_sight import find_visible, project_outlines
 from systems.drawing.solids import border_rays, clip_polygon, view_planes
 from systems.markers.layout import Marker, MarkerMap
 from systems.validation import require, require_non_negative, require_positive
@@ -28,7 +30,6 @@ Array = NDArray[np.float64]
 _FLATNESS = 0.02  # px by which a straight piece of a marker's edge may miss the line
 _ROUNDNESS = 0.05  # px by which a hole's polygon may miss the circle
 _FINEST = 2.0  # px: what is smaller is not told apart and becomes part of the mean grey
-_HORIZON = 0.02  # cosine: a patch nearer to the horizon than this is left out
 _RIM_CORNERS = 256
 
 
@@ -152,6 +153,11 @@ class DrawnShell:
         together = np.concatenate(corners)
         return together, rng.normal(0.0, p.spangle, len(together))
 
+    @cached_property
+    def patch_places(self) -> Array:
+        """A corner of each patch, (n, 3)."""
+        return self.patches[0][:, 0].copy()
+
 
 def _unit(yaw: Array, pitch: Array) -> Array:
     return np.stack(
@@ -226,6 +232,7 @@ class _Look:
         self.camera, self.shell, self.R, self.centre = camera, shell, R, centre
         self.parameters = shell.parameters
         self.eye = -(centre @ R)  # the camera in the shell's frame
+        self._seen_from = packed(self.eye), packed(R), packed(centre)
         far = float(np.linalg.norm(centre))
         self.nearest = far - shell.radius
         self.horizon = shell.radius / far  # cosine, at the centre
@@ -267,7 +274,7 @@ class _Look:
             return []
         corners, steps = self.shell.patches
         size = 2 * self.parameters.spangle_size / self.shell.radius
-        near = np.flatnonzero(self._in_sight(corners[:, 0], size))
+        near = np.flatnonzero(self._in_sight(self.shell.patch_places, size))
         places, chosen = self._project(self.shell.radius * corners[near])
         if not len(chosen):
             return []
@@ -340,23 +347,13 @@ class _Look:
 
     def _in_sight(self, places: Array, reach: Array | float) -> NDArray[np.bool_]:
         """Whether what reaches `reach` (rad) around unit vectors (n, 3) may be in the picture."""
-        away = self.eye / np.linalg.norm(self.eye)
-        visible = places @ away > self.horizon
-        if not visible.any():
-            return visible
-        seen = np.flatnonzero(visible)
-        p_C = self.shell.radius * (places[seen] @ self.R.T) + self.centre
-        ahead = p_C[:, 2] > NEAREST
-        grown = np.broadcast_to(reach, len(places))[seen] * self.shell.radius
-        grown *= float(self.camera.K[[0, 1], [0, 1]].max())
-        pixels = np.full((len(seen), 2), np.inf)
-        pixels[ahead] = self.camera.project(p_C[ahead])
-        slack = grown / np.maximum(p_C[:, 2], NEAREST)
-        # The lens may enlarge what it bends.
-        slack *= 2.0 if self.camera.distorted else 1.2
-        high = np.array([self.camera.width, self.camera.height])
-        near = (pixels > -slack[:, None]) & (pixels < high + slack[:, None])
-        visible[seen] = ahead & near.all(axis=1)
+        visible = np.empty(len(places), bool)
+        slack = 2.0 if self.camera.distorted else 1.2  # the lens may enlarge what it bends
+        find_visible(
+            packed(places), np.array(reach, float).reshape(-1), *self._seen_from, self.horizon,
+            self.shell.radius, *self.camera.matrices, float(self.camera.width),
+            float(self.camera.height), slack, visible,
+        )  # fmt: skip
         return visible
 
     def _project(self, corners: Array) -> tuple[Array, NDArray[np.intp]]:
@@ -368,15 +365,10 @@ class _Look:
         Returns:
             (c, k, 2) px, and (c,) which of them.
         """
-        # The angle between the sphere's normal and the line of sight, as far as it shrinks areas.
-        toward = self.eye - corners
-        facing = np.einsum("mki,mki->mk", toward, corners)
-        least = _HORIZON * self.shell.radius * np.linalg.norm(toward, axis=2)
-        p_C = corners @ self.R.T + self.centre
-        good = ((facing > least) & (p_C[:, :, 2] > NEAREST)).all(axis=1)
-        fold = self.camera.fold_radius
-        if np.isfinite(fold):
-            far = np.hypot(p_C[:, :, 0], p_C[:, :, 1]) > 0.98 * fold * p_C[:, :, 2]
-            good &= ~far.any(axis=1)
+        places, good = np.empty((*corners.shape[:2], 2)), np.empty(len(corners), bool)
+        project_outlines(
+            in_rows(corners, *corners.shape[1:]), *self._seen_from, self.shell.radius,
+            *self.camera.matrices, self.camera.fold_radius, places, good,
+        )  # fmt: skip
         chosen = np.flatnonzero(good)
-        return self.camera.project(p_C[chosen]), chosen
+        return places[chosen], chosen
