@@ -9,10 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.cameras import PinholeCamera
-from systems.noise import coarse_normals
+from systems.compiled import compiled
+from systems.noise import coarse_bits
 from systems.validation import require, require_non_negative, require_positive
 
 Image = NDArray[np.uint8]
+
+_NO_NOISE = np.zeros(0, np.uint16), np.zeros(0, np.float32)
 
 
 @dataclass
@@ -126,14 +129,40 @@ def expose(image: Image, effects: ImageEffects, rng: np.random.Generator) -> Ima
     if effects.gain == 1 and effects.gamma == 1 and not noisy:
         return image
     levels = np.arange(256, dtype=np.float32) * np.float32(effects.gain)
-    light = cv2.LUT(image, levels)
-    if noisy:
-        variance = effects.read_noise**2 + effects.shot_noise**2 / 255 * levels
-        light += cv2.LUT(image, np.sqrt(variance)) * coarse_normals(rng, light.shape)
-    np.clip(light, 0, 255, out=light)
+    variance = effects.read_noise**2 + effects.shot_noise**2 / 255 * levels
+    light = np.empty(image.shape, np.float32)
+    bits, normals = coarse_bits(rng, light.size) if noisy else _NO_NOISE
+    pixels = np.require(image, np.uint8, "CW").reshape(-1)
+    _shed_light(pixels, levels, np.sqrt(variance), bits, normals, light.reshape(-1))
     if effects.gamma != 1:
         light = 255 * (light / 255) ** np.float32(1 / effects.gamma)
     return np.rint(light, out=light).astype(np.uint8)
+
+
+@compiled("void(u1[::1], f4[::1], f4[::1], u2[::1], f4[::1], f4[::1])")
+def _shed_light(
+    pixels: Image,
+    levels: NDArray[np.float32],
+    deviation: NDArray[np.float32],
+    bits: NDArray[np.uint16],
+    normals: NDArray[np.float32],
+    light: NDArray[np.float32],
+) -> None:
+    """Writes what a sensor counts of pixels (n,), 0 to 255.
+
+    Args:
+        pixels: (n,).
+        levels: (256,) without noise.
+        deviation: (256,) of the noise.
+        bits: (n,) which of the normal numbers; of size 0 without noise.
+        normals: (65536,).
+        light: (n,), written.
+    """
+    for k in range(len(pixels)):
+        level = levels[pixels[k]]
+        if len(bits):
+            level += deviation[pixels[k]] * normals[bits[k]]
+        light[k] = min(max(level, np.float32(0)), np.float32(255))
 
 
 def linear_light(image: Image) -> Image:

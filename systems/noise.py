@@ -9,7 +9,6 @@ is Philox (Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011
 from __future__ import annotations
 
 import hashlib
-import math
 from functools import lru_cache
 from statistics import NormalDist
 
@@ -51,15 +50,19 @@ def _normal_quantiles() -> NDArray[np.float32]:
     return np.array([normal.inv_cdf((k + 0.5) / 2**16) for k in range(2**16)], np.float32)
 
 
-def coarse_normals(random: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.float32]:
-    """Returns standard normal numbers of 16 random bits each, six times faster than NumPy's.
+def coarse_bits(
+    random: np.random.Generator, count: int
+) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+    """Returns normal numbers of 16 random bits each, six times faster than NumPy's.
 
     They are the 65536 quantiles, from -4.3 to 4.3: enough for the noise of a picture's pixels,
     whose grey levels are coarser.
+
+    Returns:
+        (count,) the bits, and (65536,) the standard normal numbers that they stand for.
     """
-    count = math.prod(shape)
     bits = random.bit_generator.random_raw((count + 3) // 4).view(np.uint16)[:count]
-    return _normal_quantiles().take(bits).reshape(shape)
+    return bits, _normal_quantiles()
 
 
 def sample_index(t: float, rate: float) -> int:
