@@ -20,6 +20,7 @@ from pydrake.systems.framework import (
     InputPort,
     LeafSystem,
     OutputPort,
+    ValueProducer,
 )
 
 from plants.adhesion_margin import Suspension, adhesion_margin
@@ -192,6 +193,12 @@ class MagneticAdhesion(LeafSystem):
             "body_poses", AbstractValue.Make([RigidTransform()])
         )
         poses = {self._body_poses_input.ticket()}
+        # To be filled in at each step: to make them takes as long as all else.
+        self._blank_forces = self.DeclareCacheEntry(
+            "forces to be filled in",
+            ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=self._calc_blank_forces),
+            {self.nothing_ticket()},
+        )
         self._forces_output = self.DeclareAbstractOutputPort(
             "forces",
             lambda: AbstractValue.Make([ExternallyAppliedSpatialForce()]),
@@ -264,12 +271,16 @@ class MagneticAdhesion(LeafSystem):
             self._centres(self._body_poses_input.Eval(context)),
             self._shell_radius + self._wheel_radius, float(magnets.force), float(magnets.gap), F,
         )  # fmt: skip
-        forces = []
-        for body, F_W in zip(self._bodies, F, strict=True):
-            force = ExternallyAppliedSpatialForce()
-            force.body_index = body
+        forces = self._blank_forces.Eval(context)
+        for force, F_W in zip(forces, F, strict=True):
             force.F_Bq_W = SpatialForce(F_W)
-            forces.append(force)
+        output.set_value(forces)
+
+    def _calc_blank_forces(self, context: Context, output: AbstractValue) -> None:
+        del context
+        forces = [ExternallyAppliedSpatialForce() for _ in self._bodies]
+        for force, body in zip(forces, self._bodies, strict=True):
+            force.body_index = body
         output.set_value(forces)
 
     def _calc_gaps(self, context: Context, output: Any) -> None:

@@ -184,7 +184,7 @@ def _carry(R: Array, turning: Array, V: Array, velocity: Array, acceleration: Ar
     Args:
         R: (3, 3) of the chassis in W.
         turning: (2, 3) of the body, told in the chassis; see `_tilted`.
-        V: (6,) velocity of the chassis in W.
+        V: (6,) velocity of the chassis in W; only asked for by an acceleration.
         velocity: (6,), changed; of size 0 for none.
         acceleration: (6,), changed; of size 0 for none.
     """
@@ -340,9 +340,8 @@ class RockingBody(LeafSystem):
         output.set_value(X_WB0.multiply(RigidTransform(RotationMatrix(R_B0B))))
 
     def _calc_velocity(self, context: Context, output: Any) -> None:
-        V = packed(self._velocity_input.Eval(context))
-        velocity = V.copy()
-        _carry(*self._turning(context), V, velocity, _NONE)
+        velocity = self._velocity_input.Eval(context).copy()
+        _carry(*self._turning(context), _NONE, velocity, _NONE)
         output.SetFromVector(velocity)
 
     def _calc_acceleration(self, context: Context, output: Any) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.compiled import compiled
-from systems.small_matrices import multiply, rotation_of, solve_positive
+from systems.small_matrices import congruence, multiply, rotation_of, solve_positive
 
 Array = NDArray[np.float64]
 
@@ -207,6 +207,18 @@ def pose_after(
     turned(R, x, gyro, reference, dt, np.empty(0), u, factor)
     carry(R, x[:SIZE], u, fading, moved, after, change)
     stand(moved, after, reach, p)
+
+
+@compiled("void(f8[:,::1], f8[::1], f8[:,::1], f8, f8[:,::1])")
+def pose_covariance(R: Array, x: Array, P: Array, reach: float, covariance: Array) -> None:
+    """Writes the covariance (6, 6) of rotation and place, of P (SIZE, SIZE); see `stand`."""
+    p, H = np.empty(3), np.zeros((6, SIZE))
+    stand(R, x, reach, p)
+    _add_cross(p, -1.0, H[3:], THETA)
+    for i in range(3):
+        H[i, THETA + i] = 1.0
+        H[3 + i, ROCK], H[3 + i, ROCK + 1] = reach * R[i, 1], -reach * R[i, 0]
+    congruence(H, P, covariance)
 
 
 @compiled("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1])")

@@ -236,10 +236,13 @@ class ShellEkf(LeafSystem):
             self._imu_input.Eval(context) if "imu" in uses else None,
             self._reference_input.Eval(context) if moves else None,
         )
-        counts = Counter(wrong)
         increment = self._increment_input.Eval(context) if "flow" in uses else _NO_INCREMENT
         told = self._marker_pose_input.Eval(context) if "marker" in uses else _NO_POSE
-        if fusion.has_news(t, memory, increment, told):
+        news = fusion.has_news(t, memory, increment, told)
+        if not (news or wrong):
+            return
+        counts = Counter(wrong)
+        if news:
             before = self._state(context)
             now = Now(t, before, memory, counts)
             fusion.take(now, increment, told)

@@ -20,7 +20,6 @@ from systems.estimators.shell_ekf_parameters import ShellEkfParameters
 from systems.estimators.shell_model import (
     BIAS,
     DELAY,
-    SIZE,
     THETA,
     ShellModel,
     State,
@@ -315,8 +314,7 @@ class ShellFusion:
         turn = self._turn_ahead(t, state, memory)
         if turn is not None:
             state, _, _ = self.model.predict(state, turn)
-        H = np.vstack([np.eye(3, SIZE), self.model.place(state)[1]])
-        return np.asarray(H @ state.P @ H.T)
+        return self.model.pose_covariance(state)
 
     def _turn_ahead(self, t: float, state: State, memory: Memory) -> Turn | None:
         start = float(memory.numbers[_TIME])

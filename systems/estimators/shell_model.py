@@ -287,6 +287,14 @@ class ShellModel:
         )  # fmt: skip
         return R, p
 
+    def pose_covariance(self, state: State) -> Array:
+        """Returns the covariance (6, 6) of rotation and place, in R, of a state without markers."""
+        covariance = np.empty((6, 6))
+        shell_arithmetic.pose_covariance(
+            packed(state.R), packed(state.x), packed(state.P), self.reach, covariance
+        )
+        return covariance
+
     def marker_pose(self, state: State, marker: int) -> tuple[Array, Array, Array]:
         """Returns the pose that a picture of a marker is to tell, and its derivative.
 
