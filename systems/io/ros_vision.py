@@ -131,6 +131,9 @@ def detections_to_ros(detections: Detections) -> Any:
     Corners in AprilTag's order, in float64; the decision margin in float32; centre and homography
     follow from the corners. An empty array does not say its family.
     """
+    array = message_class("apriltag_msgs/msg/AprilTagDetectionArray")
+    if not len(detections):
+        return array(header(detections.stamp, detections.frame_id), [])
     point = message_class("apriltag_msgs/msg/Point")
     detection = message_class("apriltag_msgs/msg/AprilTagDetection")
     H = homographies(detections.corners)
@@ -156,9 +159,7 @@ def detections_to_ros(detections: Detections) -> Any:
         )
         for number, bits, margin, centre, corners, homography in columns
     ]
-    return message_class("apriltag_msgs/msg/AprilTagDetectionArray")(
-        header(detections.stamp, detections.frame_id), found
-    )
+    return array(header(detections.stamp, detections.frame_id), found)
 
 
 def detections_from_ros(
