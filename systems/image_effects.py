@@ -130,12 +130,13 @@ def expose(image: Image, effects: ImageEffects, rng: np.random.Generator) -> Ima
         return image
     levels = np.arange(256, dtype=np.float32) * np.float32(effects.gain)
     variance = effects.read_noise**2 + effects.shot_noise**2 / 255 * levels
-    light = np.empty(image.shape, np.float32)
+    light: NDArray[np.float32] = np.empty(image.shape, np.float32)
     bits, normals = coarse_bits(rng, light.size) if noisy else _NO_NOISE
-    pixels = np.require(image, np.uint8, "CW").reshape(-1)
+    pixels = np.require(image, np.uint8, ["C", "W"]).reshape(-1)
     _shed_light(pixels, levels, np.sqrt(variance), bits, normals, light.reshape(-1))
     if effects.gamma != 1:
-        light = 255 * (light / 255) ** np.float32(1 / effects.gamma)
+        np.power(light / 255, np.float32(1 / effects.gamma), out=light)
+        light *= 255
     return np.rint(light, out=light).astype(np.uint8)
 
 
