@@ -44,6 +44,7 @@ X_BC = RigidTransform(
     RotationMatrix(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])),
     [0.1, 0.0, 0.2],
 )
+WANDER, WANDER_TIME = 0.5, 1.0  # of the slip: standard deviation by its mean, correlation time, s
 _TICKS = 20000  # of which noise is at hand
 FAMILY = family("36h11")
 
@@ -157,8 +158,9 @@ class SlippingRobot(LeafSystem):
         k = round(context.get_time() * RATE)
         mine, step = self._mine[k], self._steps[int(k * CONTROL / RATE)]
         wander = float(context.get_discrete_state(self._wander)[0])
-        wander += -wander * dt + math.sqrt(2 * dt) * mine[0]  # a second's memory, deviation 1
-        left = 1 - t.slip * (1 + 0.5 * wander)
+        fades = dt / WANDER_TIME
+        wander += -wander * fades + math.sqrt(2 * fades) * mine[0]  # of deviation 1
+        left = 1 - t.slip * (1 + WANDER * wander)
         v, omega = left * self._command_input.Eval(context)
         omega += t.yaw_noise * step
         x, y, theta = context.get_discrete_state(self._pose).get_value()
@@ -230,16 +232,19 @@ class Eye(LeafSystem):
 def ekf_parameters(slip: float = 0.05, yaw_noise: float = 0.1) -> PlanarEkfParameters:
     """The filter of a robot that is known to slip about as much, and to do nothing else.
 
-    The scale walks away as fast as the slip wanders in the short run; of the ticks every fifth
-    begins with another yaw rate. What a real robot does besides, and `SlippingRobot` does not, is
-    zero: noise of distance, side and turn, and errors of the gyro's scale.
+    How much it slips in the mean it learns; how far and how fast that wanders it is told. Of the
+    ticks every fifth begins with another yaw rate. What a real robot does besides, and
+    `SlippingRobot` does not, is zero: noise of distance, side and turn, and errors of the gyro's
+    scale.
     """
     return PlanarEkfParameters(
         speed_noise=0.0,
         slip_noise=0.0,
         side_noise=0.0,
         turn_noise=0.0,
-        scale_walk=slip / math.sqrt(2),
+        scale_walk=0.0,
+        scale_wander=slip * WANDER,
+        scale_wander_time=WANDER_TIME,
         gyro_bias_std=Truth.gyro_bias,
         gyro_bias_walk=0.0,
         gyro_scale_std=0.0,

@@ -69,8 +69,8 @@ class Memory:
 
         Args:
             k: number of the tick.
-            x: (6,) state at its beginning; counts only if there is no older tick to go back to.
-            P: (6, 6).
+            x: (7,) state at its beginning; counts only if there is no older tick to go back to.
+            P: (7, 7).
             drive: its speed; its yaw rate is what is expected until `measure_yaw_rate`, and until
                 then its turn variance counts.
         """
@@ -129,7 +129,7 @@ class Memory:
         Args:
             first: where to begin; all from there on must be remembered.
             last: the tick under way.
-            noise: (8,) see `planar_model.predict_into`.
+            noise: (10,) see `planar_model.predict_into`.
             rules: (3,) see `planar_model.correct_into`.
             look_at: stamp of the measurement that the caller wants to hear of.
 

@@ -135,7 +135,7 @@ class PlanarEkf(LeafSystem):
         self._noise = np.array(p.process_noise())
         self._rules = np.array([p.stamp_noise**2, p.squared_gate(), p.ambiguous == "nearest"])
         self._floor = np.diag(np.square(p.measurement_floor))
-        self._unknown = unknown(p.gyro_bias_std, p.scale_std, p.gyro_scale_std)
+        self._unknown = unknown(p.gyro_bias_std, p.scale_std, p.gyro_scale_std, p.scale_wander)
         self._gyro_ticks = 1 + round(p.gyro_delay * rate)
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._imu_input = self.DeclareVectorInputPort("imu", 6)
@@ -202,7 +202,7 @@ class PlanarEkf(LeafSystem):
         return self._learned(context, BIAS)
 
     def wheel_scale(self, context: Context) -> tuple[float, float]:
-        """Returns the estimated true speed by commanded speed and its standard deviation."""
+        """Returns the estimated true speed by commanded speed, in the mean, and its deviation."""
         return self._learned(context, SCALE)
 
     def gyro_scale(self, context: Context) -> tuple[float, float]:

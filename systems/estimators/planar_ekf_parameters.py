@@ -23,7 +23,10 @@ class PlanarEkfParameters:
         side_noise: random walk of the sideways position by turning, m/sqrt(rad): the point that a
             differential drive turns about wanders by millimetres.
         scale_std: standard deviation of the wheels' scale at the start.
-        scale_walk: how fast the scale changes (battery, floor), 1/sqrt(s).
+        scale_walk: how fast the scale changes for good (battery, floor), 1/sqrt(s).
+        scale_wander: standard deviation of the scale about its mean, as slip comes and goes.
+        scale_wander_time: how long that lasts, s: the time in which its correlation fades to 1/e.
+            Without markers in view dead reckoning goes on with the mean.
         speed_lag: time constant of the motors between command and motion, s; geared ones take some
             0.1 s.
         wheel_radius: for `wheel_speeds`, m.
@@ -68,6 +71,8 @@ class PlanarEkfParameters:
     side_noise: float = 0.002
     scale_std: float = 0.1
     scale_walk: float = 0.003
+    scale_wander: float = 0.0
+    scale_wander_time: float = 1.0
     speed_lag: float = 0.0
     wheel_radius: float = 0.0325
     gyro_noise: float = 8.7e-5
@@ -91,15 +96,15 @@ class PlanarEkfParameters:
 
     def __post_init__(self) -> None:
         zero_allowed = (
-            "speed_noise", "slip_noise", "side_noise", "scale_walk", "speed_lag", "gyro_noise",
-            "turn_noise", "gyro_bias_walk", "gyro_delay", "gyro_scale_std",
+            "speed_noise", "slip_noise", "side_noise", "scale_walk", "scale_wander", "speed_lag",
+            "gyro_noise", "turn_noise", "gyro_bias_walk", "gyro_delay", "gyro_scale_std",
             "gyro_scale_walk", "yaw_rate_change", "lost_speed_noise", "lost_turn_noise",
             "stamp_noise",
         )  # fmt: skip
         require_non_negative(**{name: getattr(self, name) for name in zero_allowed})
         above_zero = (
-            "scale_std", "wheel_radius", "gyro_bias_std", "gyro_range", "gate", "horizon",
-            "recovery_time",
+            "scale_std", "scale_wander_time", "wheel_radius", "gyro_bias_std", "gyro_range", "gate",
+            "horizon", "recovery_time",
         )  # fmt: skip
         require_positive(**{name: getattr(self, name) for name in above_zero})
         floor = self.measurement_floor
@@ -139,6 +144,8 @@ class PlanarEkfParameters:
             bias=self.gyro_bias_walk**2,
             scale=self.scale_walk**2,
             gyro_scale=self.gyro_scale_walk**2,
+            wander=self.scale_wander**2,
+            fading=1 / self.scale_wander_time,
         )
 
     def squared_gate(self) -> float:

@@ -1,10 +1,13 @@
 """Motion and measurement model of a robot that knows its commands, its gyro and marker poses.
 
 State: x (m), y (m), theta (rad) of base_link in map, the bias of the gyro (rad/s), the scale of the
-wheels (true speed by commanded speed), and the scale of the gyro (true turn by measured turn). Bias
-and scales are states, not noise, because they last: an error of 0.02 rad/s or 3 % is the same now
-as in the last second, so markers tell what it is and dead reckoning goes on with it. White noise in
-their place, as in [NAV], would have to be so large that the covariance says nothing.
+wheels (true speed by commanded speed), the scale of the gyro (true turn by measured turn), and how
+far the wheels' scale is now from where it is in the mean. Bias and scales are states, not noise,
+because they last: an error of 0.02 rad/s or 3 % is the same now as in the last second, so markers
+tell what it is and dead reckoning goes on with it. White noise in their place, as in [NAV], would
+have to be so large that the covariance says nothing. Slip that comes and goes lasts for a while: a
+Gauss-Markov process of first order (Gelb, ed., "Applied optimal estimation", 1974, section 3.8),
+which dead reckoning lets fade to the mean as fast as it does in fact.
 
 Covariances are in the order of the state. All functions are pure; times in seconds.
 """
@@ -24,8 +27,8 @@ from systems.small_matrices import congruence, solve_positive
 
 Array = NDArray[np.float64]
 
-SIZE = 6
-THETA, BIAS, SCALE, GYRO_SCALE = 2, 3, 4, 5
+SIZE = 7
+THETA, BIAS, SCALE, GYRO_SCALE, WANDER = 2, 3, 4, 5, 6
 
 VERDICTS = ("started", "accepted", "gated", "ambiguous")  # the last: refused for that
 _STARTED, _ACCEPTED, _GATED, _AMBIGUOUS = range(4)
@@ -62,6 +65,8 @@ class ProcessNoise(NamedTuple):
         bias: of the gyro's bias, by time, (rad/s)^2/s.
         scale: of the wheels' scale, by time, 1/s.
         gyro_scale: of the gyro's scale, by time, 1/s.
+        wander: of the wheels' scale about its mean; does not grow.
+        fading: rate at which the wheels' scale returns to its mean, 1/s.
     """
 
     speed: float
@@ -72,18 +77,23 @@ class ProcessNoise(NamedTuple):
     bias: float
     scale: float
     gyro_scale: float
+    wander: float = 0.0
+    fading: float = 0.0
 
 
-def unknown(bias_std: float, scale_std: float, gyro_scale_std: float) -> tuple[Array, Array]:
-    """Returns state (6,) and covariance (6, 6) before anything is known of the pose.
+def unknown(
+    bias_std: float, scale_std: float, gyro_scale_std: float, wander_std: float = 0.0
+) -> tuple[Array, Array]:
+    """Returns state (7,) and covariance (7, 7) before anything is known of the pose.
 
     Args:
         bias_std: standard deviation of the gyro's bias, rad/s.
         scale_std: of the wheels' scale.
         gyro_scale_std: of the gyro's scale.
+        wander_std: of the wheels' scale about its mean.
     """
-    x = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0])
-    known = np.square([bias_std, scale_std, gyro_scale_std])
+    x = np.array([0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 0.0])
+    known = np.square([bias_std, scale_std, gyro_scale_std, wander_std])
     return x, np.diag([UNKNOWN, UNKNOWN, UNKNOWN, *known])
 
 
@@ -98,8 +108,8 @@ def predict(
     """Dead-reckons one step with the heading of its middle, which follows an arc to second order.
 
     Args:
-        x: (6,) state.
-        P: (6, 6) its covariance.
+        x: (7,) state.
+        P: (7, 7) its covariance.
         drive: speed and yaw rate, constant over the step.
         dt: length of the step, s.
         noise: variance rates.
@@ -113,23 +123,32 @@ def predict(
     return predicted, grown
 
 
-def linearize(x: Array, drive: Drive, dt: float) -> tuple[Array, Array, Array]:
-    """Returns the derivatives of one step and where it leads.
+def linearize(x: Array, drive: Drive, dt: float, fading: float = 0.0) -> tuple[Array, Array, Array]:
+    """Returns the derivatives of one step and where it leads; `fading` as in `ProcessNoise`.
 
     Returns:
-        F: (6, 6) by the state. G: (6, 6) by what noise adds over the step: distance along and
-        across the heading (m), heading (rad), bias (rad/s), scales. The state after it: (6,).
+        F: (7, 7) by the state. G: (7, 7) by what noise adds over the step: distance along and
+        across the heading (m), heading (rad), bias (rad/s), scales, the wheels' deviation from
+        theirs. The state after it: (7,).
     """
     F, G, predicted = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty(SIZE)
-    _linearize(packed(x), drive.speed, drive.yaw_rate, dt, F, G, predicted)
+    _linearize(packed(x), drive.speed, drive.yaw_rate, dt, fading, F, G, predicted)
     return F, G, predicted
 
 
-@compiled("void(f8[::1], f8, f8, f8, f8[:,::1], f8[:,::1], f8[::1])")
+@compiled("void(f8[::1], f8, f8, f8, f8, f8[:,::1], f8[:,::1], f8[::1])")
 def _linearize(
-    x: Array, speed: float, yaw_rate: float, dt: float, F: Array, G: Array, predicted: Array
+    x: Array,
+    speed: float,
+    yaw_rate: float,
+    dt: float,
+    fading: float,
+    F: Array,
+    G: Array,
+    predicted: Array,
 ) -> None:
-    theta, bias, scale, gyro_scale = x[THETA], x[BIAS], x[SCALE], x[GYRO_SCALE]
+    theta, bias, gyro_scale = x[THETA], x[BIAS], x[GYRO_SCALE]
+    scale = x[SCALE] + x[WANDER]
     measured = (yaw_rate - bias) * dt
     turn = gyro_scale * measured
     c, s = math.cos(theta + turn / 2), math.sin(theta + turn / 2)
@@ -144,12 +163,15 @@ def _linearize(
     F[2, 3], F[2, 5] = -gyro_scale * dt, measured
     F[0, 3], F[1, 3] = dy * gyro_scale * dt / 2, -dx * gyro_scale * dt / 2
     F[0, 4], F[1, 4] = by_scale_x, by_scale_y
+    F[0, 6], F[1, 6] = by_scale_x, by_scale_y
+    F[6, 6] = math.exp(-fading * dt)
     F[0, 5], F[1, 5] = -dy * measured / 2, dx * measured / 2
     G[0, 0], G[1, 0] = c, s
     G[0, 1], G[1, 1] = -s, c
     # Turning noise comes evenly over the step: the middle has half of it.
     G[0, 2], G[1, 2] = -dy / 2, dx / 2
     predicted[0], predicted[1] = x[0] + dx, x[1] + dy
+    predicted[WANDER] = F[6, 6] * x[WANDER]
     predicted[THETA] = math.pi - (math.pi - theta - turn) % (2 * math.pi)
 
 
@@ -160,24 +182,26 @@ def predict_into(
     """Writes what `predict` returns, not into x or P; for compiled callers.
 
     Args:
-        x: (6,).
-        P: (6, 6).
+        x: (7,).
+        P: (7, 7).
         step: (6,) the entries of `Drive`, then dt.
-        noise: (8,) the entries of `ProcessNoise`.
-        predicted: (6,), written.
-        grown: (6, 6), written.
+        noise: (10,) the entries of `ProcessNoise`.
+        predicted: (7,), written.
+        grown: (7, 7), written.
     """
     speed, yaw_rate, speed_variance, turn_variance, gyro_weight, dt = step
     speed_noise, slip_noise, side_noise, gyro_noise, turn_noise = noise[:5]
     F, G, added = np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE)), np.empty((SIZE, SIZE))
-    _linearize(x, speed, yaw_rate, dt, F, G, predicted)
+    wander, fading = noise[8], noise[9]
+    _linearize(x, speed, yaw_rate, dt, fading, F, G, predicted)
     v, omega = abs(speed), abs(yaw_rate)
     Q = np.zeros((SIZE, SIZE))
     Q[0, 0] = (speed_noise + slip_noise * v + speed_variance) * dt
     Q[1, 1] = side_noise * omega * dt
     Q[2, 2] = ((gyro_noise + turn_noise * omega) * gyro_weight + turn_variance) * dt
-    for i in range(3, SIZE):
+    for i in range(3, WANDER):
         Q[i, i] = noise[2 + i] * dt
+    Q[6, 6] = wander * (1 - F[6, 6] ** 2)  # keeps the variance where it is in the long run
     congruence(G, Q, added)
     congruence(F, P, grown)
     for i in range(SIZE):
@@ -192,8 +216,8 @@ def update(x: Array, P: Array, z: Array, R: Array) -> tuple[Array, Array]:
     does to K: marker poses can be a thousand times as exact as the prediction.
 
     Args:
-        x: (6,) state.
-        P: (6, 6).
+        x: (7,) state.
+        P: (7, 7).
         z: (3,) measured [x, y, theta].
         R: (3, 3) its covariance.
 
@@ -260,11 +284,11 @@ class Correction:
 
     Attributes:
         verdict: one of `VERDICTS`.
-        x: (6,) state after it.
-        P: (6, 6) covariance after it.
+        x: (7,) state after it.
+        P: (7, 7) covariance after it.
         nis: squared Mahalanobis distance by degrees of freedom; NaN if none was looked at.
-        x_before: (6,) state before it, at the time of the picture.
-        P_before: (6, 6).
+        x_before: (7,) state before it, at the time of the picture.
+        P_before: (7, 7).
     """
 
     verdict: str
@@ -288,8 +312,8 @@ def correct(
     """Starts from a measurement, takes it, or refuses it.
 
     Args:
-        x: (6,) state at the time of the picture.
-        P: (6, 6).
+        x: (7,) state at the time of the picture.
+        P: (7, 7).
         measurement: with its second solution, if there is one.
         drive: how the robot moved then.
         stamp_variance: of the time of the picture, s^2.
@@ -326,16 +350,16 @@ def correct_into(
     """Writes state and covariance of what `correct` returns, not into x or P; for compiled callers.
 
     Args:
-        x: (6,).
-        P: (6, 6).
+        x: (7,).
+        P: (7, 7).
         poses: (1 or 2, 3).
         covariances: (1 or 2, 3, 3).
         ambiguous: see `Measurement`.
         speed: see `Drive`.
         yaw_rate: see `Drive`.
         rules: (3,) variance of the stamp (s^2), gate, and 1 or 0 for `take_ambiguous`.
-        corrected: (6,), written.
-        reduced: (6, 6), written.
+        corrected: (7,), written.
+        reduced: (7, 7), written.
 
     Returns:
         Index of the verdict in `VERDICTS`, and NIS.
@@ -347,9 +371,10 @@ def correct_into(
         return _AMBIGUOUS, math.nan
     theta = x[THETA] if known else poses[0, THETA]
     # Taken a moment earlier or later, it would show a pose further back or ahead.
+    v = (x[SCALE] + x[WANDER]) * speed
     velocity = (
-        x[SCALE] * speed * math.cos(theta),
-        x[SCALE] * speed * math.sin(theta),
+        v * math.cos(theta),
+        v * math.sin(theta),
         x[GYRO_SCALE] * (yaw_rate - x[BIAS]),
     )
     R, S, y = np.empty((len(poses), 3, 3)), np.empty((3, 3)), np.empty(3)

@@ -17,6 +17,7 @@ from systems.controllers.pure_pursuit import PurePursuit
 from systems.controllers.tvlqr import Tvlqr
 from systems.estimators.planar_ekf import PlanarEkf
 from tests.benchmarks.table import Row, show
+from tests.replay_bound import least_covariance
 from tests.replay_world import Truth, circuit, replay
 
 CIRCUITS = range(20)
@@ -48,12 +49,16 @@ class Lap(NamedTuple):
         most: of it, m.
         nees: of the estimate, by dimension.
         nis: of the pictures, by degrees of freedom.
+        lost: error of the position at the end of a blind stretch, m; NaN without one.
+        least: its deviation where dead reckoning is as good as it can be, m.
     """
 
     rmse: float
     most: float
     nees: float
     nis: float
+    lost: float
+    least: float
 
 
 def rows() -> Iterator[Row]:
@@ -66,10 +71,10 @@ def rows() -> Iterator[Row]:
 def tracking_rows() -> Iterator[Row]:
     """Each tracker under each condition: the worst circuit counts."""
     for what, (truth, rmse, most) in CONDITIONS.items():
-        consistent = []
+        all_laps: list[Lap] = []
         for name in TRACKERS:
             laps = _laps(name, truth)
-            consistent += [(lap.nees, lap.nis) for lap in laps]
+            all_laps += laps
             a, b = max(lap.rmse for lap in laps), max(lap.most for lap in laps)
             yield Row(
                 f"{what}: {name}, worst of {len(laps)} circuits",
@@ -78,9 +83,15 @@ def tracking_rows() -> Iterator[Row]:
                 a <= rmse and b <= most,
                 f"RMSE over all {100 * np.sqrt(np.mean([lap.rmse**2 for lap in laps])):.2f} cm",
             )
-        nees, nis = np.mean(consistent, axis=0)
+        nees, nis = np.mean([(lap.nees, lap.nis) for lap in all_laps], axis=0)
         yield Row(f"{what}: NEES and NIS per dimension", f"{nees:.2f}, {nis:.2f}",
                   "0.8 to 1.25", bool(0.8 <= nees <= 1.25 and 0.8 <= nis <= 1.25))  # fmt: skip
+        if np.isfinite(truth.blind[1]):
+            lost, least = np.sqrt(np.mean([(a.lost**2, a.least**2) for a in all_laps], axis=0))
+            yield Row(
+                f"{what}: position at the end of it, RMS", f"{100 * lost:.1f} cm", "", None,
+                f"least, by an oracle of the slip at its beginning: {100 * least:.1f} cm",
+            )  # fmt: skip
 
 
 def odometry_rows() -> Iterator[Row]:
@@ -130,9 +141,14 @@ def _lap(seed: int, *, name: str, truth: Truth) -> Lap:
     world = circuit(seed)
     drive = replay(world, TRACKERS[name](route=world.route), truth=truth, seed=seed)
     off = drive.cross_track(world.route, every=5)
+    lost = least = float("nan")
+    if np.isfinite(truth.blind[1]):
+        k = int(np.searchsorted(drive.t, truth.blind[1] - 1e-9))
+        lost = float(np.linalg.norm((drive.estimate - drive.pose)[k, :2]))
+        least = float(np.sqrt(np.trace(least_covariance(drive, truth))))
     return Lap(
         float(np.sqrt(np.mean(off**2))), float(np.abs(off).max()), float(drive.nees().mean()),
-        float(drive.nis.mean()) if len(drive.nis) else float("nan"),
+        float(drive.nis.mean()) if len(drive.nis) else float("nan"), lost, least,
     )  # fmt: skip
 
 
