@@ -74,4 +74,4 @@ def packed(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def in_rows(values: NDArray[np.float64], *shape: int) -> NDArray[np.float64]:
     """Returns values, packed, as an array of shape (-1, *shape)."""
-    return packed(values.reshape(-1, *shape))
+    return packed(values if values.shape[1:] == shape else values.reshape(-1, *shape))

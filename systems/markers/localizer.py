@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields
 
 import numpy as np
@@ -15,13 +16,14 @@ from systems.health import Counts
 from systems.markers.carried_pose import pose_of_body
 from systems.markers.corner_noise import corner_deviation
 from systems.markers.layout import MarkerMap
-from systems.markers.planar_pose import SAME_POSE, angle_between, closed_form, planar_poses
+from systems.markers.planar_pose import SAME_POSE, closed_form, planar_poses
 from systems.markers.pnp import (
     PnpSolution,
     covariance,
     refine,
     squared_errors_by_object,
 )
+from systems.markers.sifting import sift
 from systems.memo import Memo
 from systems.messages import Detections, PoseEstimate
 from systems.validation import require, require_non_negative, require_positive
@@ -155,6 +157,7 @@ class MapLocalizer:
         self.X_BC = X_BC
         self.parameters = parameters or LocalizerParameters()
         self.body_frame = body_frame
+        self._nothing = PoseEstimate(frame_id=marker_map.frame, child_frame_id=body_frame)
         self._index = {marker.id: k for k, marker in enumerate(marker_map)}
         self._sizes = np.array([marker.size for marker in marker_map])
         self._corners = marker_map.corners(np.array(list(self._index)))
@@ -167,66 +170,70 @@ class MapLocalizer:
     def locate(self, detections: Detections) -> Localization:
         """Solves the body's pose from one picture's detections; never NaN, never an exception."""
         dropped = dict.fromkeys(REASONS, 0)
-        seen = self._usable(detections, dropped) if len(detections) else detections
-        nothing = PoseEstimate(frame_id=self.marker_map.frame, child_frame_id=self.body_frame)
-        if len(seen) == 0:
-            return Localization(nothing, nothing, dropped)
-        rays, by_ray = self.camera.rays(seen.corners)
+        nothing = Localization(self._nothing, self._nothing, dropped)
+        if len(detections) == 0:
+            return nothing
+        index, corners = self._usable(detections, dropped)
+        if len(index) == 0:
+            return nothing
+        rays, by_ray = self.camera.rays(corners)
         p = self.parameters
-        deviation = corner_deviation(seen.corners, p.pixel_noise, p.pixel_noise_by_side)
-        by_ray = by_ray / deviation[:, None, None, None]
-        index = np.array([self._index[int(i)] for i in seen.ids])
+        deviation = corner_deviation(corners, p.pixel_noise, p.pixel_noise_by_side)
+        by_ray /= deviation[:, None, None, None]
         view = _View(index, self._corners[index], rays, by_ray, deviation)
         solvable, R_CM, p_CM = closed_form(rays, self._sizes[index])
-        dropped["bad_corners"] += int((~solvable).sum())
         view = view.select(solvable)
-        used = np.ones(len(view.index), bool)
-        if len(view.index) == 0:
-            return Localization(nothing, nothing, dropped)
-        if len(view.index) == 1:
+        count = len(view.index)
+        dropped["bad_corners"] += len(index) - count
+        if count == 0:
+            return nothing
+        if count == 1:
             solutions = self._single(view)
+            errors = view.errors_by_marker(solutions.R, solutions.p)
         else:
-            solutions, used = self._common_pose(*self._candidates(R_CM, p_CM, view.index), view)
-        if len(solutions) == 0 or not np.isfinite(solutions.squared_error[0]):
-            dropped["bad_corners"] += len(view.index)
-            return Localization(nothing, nothing, dropped)
-        dropped["outlier"] += int((~used).sum())
-        by_marker = view.select(used).errors_by_marker(solutions.R, solutions.p)
-        rms = np.sqrt(np.mean(by_marker**2, axis=1))
+            candidates = self._candidates(R_CM, p_CM, view.index)
+            solutions, errors = self._common_pose(*candidates, view)
+        if len(solutions) == 0 or not math.isfinite(solutions.squared_error[0]):
+            dropped["bad_corners"] += count
+            return nothing
+        used = errors.shape[1]
+        dropped["outlier"] += count - used
+        rms = np.sqrt((errors * errors).sum(axis=1) / used).tolist()
         if rms[0] > p.max_reprojection:
             dropped["inconsistent"] += 1
-            return Localization(nothing, nothing, dropped)
+            return nothing
         ambiguous = False
         if len(solutions) > 1:
-            ratio = _log_likelihood_ratio(solutions.squared_error, 8 * int(used.sum()))
-            ambiguous = bool(ratio < np.log(p.ambiguity_ratio))
+            first, second = solutions.squared_error.tolist()
+            ratio = _log_likelihood_ratio(first, second, 8 * used)
+            ambiguous = ratio < math.log(p.ambiguity_ratio)
+        covariances = covariance(solutions.information, 1.0)
         estimates = [
-            self._estimate(solutions, k, rms[k], detections.stamp, ambiguous, int(used.sum()))
+            self._estimate(
+                solutions.R[k], solutions.p[k], covariances[k], rms[k], detections.stamp,
+                ambiguous, used,
+            )
             for k in range(len(solutions))
             if rms[k] <= p.max_reprojection
-        ]
-        return Localization(estimates[0], estimates[1] if len(estimates) > 1 else nothing, dropped)
+        ]  # fmt: skip
+        pose, alternative, *_ = *estimates, self._nothing
+        return Localization(pose, alternative, dropped)
 
-    def _usable(self, detections: Detections, dropped: dict[str, int]) -> Detections:
-        """Returns the detections that serve, the largest first, counting the others."""
-        ids = detections.ids.tolist()
+    def _usable(
+        self, detections: Detections, dropped: dict[str, int]
+    ) -> tuple[NDArray[np.intp], Array]:
+        """Returns where the markers that serve are in the map, and their corners.
+
+        The largest come first; the others are counted.
+        """
         ours = detections.family in ("", self.marker_map.family.name)
-        known = np.array([ours and i in self._index for i in ids], bool)
-        dropped["unknown_id"] += int((~known).sum())
-        # Of two of one id none can be told to be the real one.
-        once = np.array([ids.count(i) == 1 for i in ids], bool)
-        dropped["repeated_id"] += int((known & ~once).sum())
-        finite = np.asarray(np.isfinite(detections.corners).all(axis=(1, 2)))
-        corners = np.where(finite[:, None, None], detections.corners, 0.0)
-        edges = corners - corners[:, [3, 0, 1, 2]]
-        large = (edges * edges).sum(axis=2).min(axis=1) >= self.parameters.min_side**2
-        dropped["bad_corners"] += int((known & once & ~finite).sum())
-        dropped["too_small"] += int((known & once & finite & ~large).sum())
-        seen = np.flatnonzero(known & once & finite & large)
-        largest_first = seen[np.argsort(-_areas(corners[seen]), kind="stable")]
-        return detections.select(
-            largest_first[:1] if self.parameters.use == "best" else largest_first
-        )
+        ids = detections.ids.tolist()
+        known = np.array([self._index.get(i, -1) if ours else -1 for i in ids], np.intp)
+        chosen, left_out = sift(known, detections.corners, self.parameters.min_side)
+        dropped |= left_out
+        if self.parameters.use == "best":
+            chosen = chosen[:1]
+        return known[chosen], detections.corners[chosen]
 
     def _candidates(self, R_CM: Array, p_CM: Array, index: NDArray[np.intp]) -> tuple[Array, Array]:
         """Returns `X_CW` by each marker's two poses: (2n, 3, 3) and (2n, 3)."""
@@ -243,20 +250,22 @@ class MapLocalizer:
             R[finite], p[finite], view.points[0], view.rays[0], view.by_ray[0], iterations=0
         )
 
-    def _common_pose(
-        self, R: Array, p: Array, view: _View
-    ) -> tuple[PnpSolution, NDArray[np.bool_]]:
-        """Returns the best one or two minima over all markers and which markers they rest on.
+    def _common_pose(self, R: Array, p: Array, view: _View) -> tuple[PnpSolution, Array]:
+        """Returns the best one or two minima over all markers that agree on them.
 
         Both poses of the first and largest marker are refined over all markers. When one of them
         then lies too far off, the search starts anew from every candidate, each with those that
         agree with it, and the largest agreement wins.
+
+        Returns:
+            The minima, the best first, and the errors (px) of the m markers that they rest on:
+            (1 or 2, m).
         """
         limit = self.parameters.max_reprojection
-        used = np.ones(len(view.index), bool)
         # A marker's other pose leads to the other minimum, where there is one.
         solution = view.refine(R[:2], p[:2])
-        if not view.agree(solution, limit).all():
+        errors = view.errors_by_marker(solution.R, solution.p)
+        if not (errors[solution.squared_error.argmin()] <= limit).all():
             # A marker's own pose, carried over to others, errs more than a common pose will.
             near = view.errors_by_marker(R, p) <= 4 * limit
             trials = [
@@ -266,7 +275,9 @@ class MapLocalizer:
                 ((used & view.agree(s, limit)).sum(), -s.squared_error.min()) for s, used in trials
             ]
             solution, used = trials[max(range(len(trials)), key=agreements.__getitem__)]
-        return _distinct_best_first(solution), used
+            errors = view.select(used).errors_by_marker(solution.R, solution.p)
+        order = _distinct_best_first(solution)
+        return solution.select(order), errors[order]
 
     def _consensus(
         self, view: _View, R: Array, p: Array, used: NDArray[np.bool_]
@@ -285,29 +296,29 @@ class MapLocalizer:
 
     def _estimate(
         self,
-        solutions: PnpSolution,
-        k: int,
+        R_CW: Array,
+        p_CW: Array,
+        covariance: Array,
         rms: float,
         stamp: float,
         ambiguous: bool,
         markers: int,
     ) -> PoseEstimate:
-        cov_C = covariance(solutions.information[k : k + 1], 1.0)[0]
         R_WB, p_WB, cov = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
-        pose_of_body(solutions.R[k], solutions.p[k], cov_C, *self._X_CB, R_WB, p_WB, cov)
+        pose_of_body(R_CW, p_CW, covariance, *self._X_CB, R_WB, p_WB, cov)
         return PoseEstimate(
             stamp=stamp,
             frame_id=self.marker_map.frame,
             child_frame_id=self.body_frame,
             pose=RigidTransform(RotationMatrix(R_WB), p_WB),
             covariance=cov,
-            reprojection_rms=float(rms),
+            reprojection_rms=rms,
             ambiguous=ambiguous,
             markers=markers,
         )
 
 
-def _log_likelihood_ratio(squared_error: Array, count: int) -> float:
+def _log_likelihood_ratio(first: float, second: float, count: int) -> float:
     """Returns the logarithm of the likelihood of the first minimum over that of the second.
 
     Corner errors have heavier tails than a Gaussian's, and one bad edge moves two corners: so the
@@ -315,33 +326,23 @@ def _log_likelihood_ratio(squared_error: Array, count: int) -> float:
     leave much, more must lie between them.
 
     Args:
-        squared_error: (2,) of residuals in units of their noise.
+        first: sum of the squared residuals in units of their noise.
+        second: of the other minimum.
         count: number of residuals.
     """
-    first, second = squared_error[:2]
-    return float((_TAIL + count) / 2 * np.log((_TAIL + second) / (_TAIL + first)))
+    return (_TAIL + count) / 2 * math.log((_TAIL + second) / (_TAIL + first))
 
 
-def _distinct_best_first(solution: PnpSolution) -> PnpSolution:
-    """Orders by error; of two that ended in one minimum, keeps one."""
-    order = np.argsort(solution.squared_error, kind="stable")
+def _distinct_best_first(solution: PnpSolution) -> list[int]:
+    """Returns the poses ordered by error; of two that ended in one minimum, the better one."""
+    error = solution.squared_error.tolist()
+    order = sorted(range(len(error)), key=error.__getitem__)
     if len(order) > 1:
-        same = angle_between(solution.R[order[0]], solution.R[order[1]]) < SAME_POSE
-        if same or not np.isfinite(solution.squared_error[order[1]]):
+        cosine = (float((solution.R[order[0]] * solution.R[order[1]]).sum()) - 1) / 2
+        same = math.acos(min(max(cosine, -1.0), 1.0)) < SAME_POSE
+        if same or not math.isfinite(error[order[1]]):
             order = order[:1]
-    return PnpSolution(
-        solution.R[order],
-        solution.p[order],
-        solution.squared_error[order],
-        solution.information[order],
-    )
-
-
-def _areas(corners: Array) -> Array:
-    """Returns (n,) areas of quadrangles (n, 4, 2)."""
-    # Half the cross product of the diagonals.
-    p, q = corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]
-    return np.asarray(np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]) / 2)
+    return order
 
 
 class Localizer(LeafSystem):

@@ -49,6 +49,14 @@ class PnpSolution:
     def __len__(self) -> int:
         return len(self.R)
 
+    def select(self, order: list[int]) -> PnpSolution:
+        """Returns the poses picked by their numbers, in that order."""
+        if order == list(range(len(self))):
+            return self
+        return PnpSolution(
+            self.R[order], self.p[order], self.squared_error[order], self.information[order]
+        )
+
 
 def rotation_from_vector(w: Array) -> Array:
     """Returns exp([w]x) of (..., 3) rotation vectors: (..., 3, 3) (Rodrigues)."""
