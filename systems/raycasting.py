@@ -72,6 +72,7 @@ class Solids:
         kept = [(i, solid) for i, solid in described if solid is not None]
         solids = [solid for _, solid in kept]
         self._order = np.array([i for i, _ in kept], np.intp)
+        self._numbers = np.append(self._order, -1)  # where -1, for none, finds itself
         k = len(kept)
         X = np.array([poses[i].GetAsMatrix34() for i in self._order]).reshape(k, 3, 4)
         centres = np.array([solid.centre for solid in solids]).reshape(k, 3)
@@ -152,9 +153,11 @@ class Solids:
             self.arrays, in_rows(np.asarray(origins), 3), in_rows(directions, 3), reach,
             distances, entered,
         )  # fmt: skip
-        hit = entered >= 0
-        entered[hit] = self._order[entered[hit]]
-        return distances, entered
+        return distances, self.numbers(entered)
+
+    def numbers(self, entered: Index) -> Index:
+        """Returns the numbers in the constructor's lists of what `cast` has found (any shape)."""
+        return self._numbers[entered]
 
     def occluded(
         self, origin: Array, targets: Array, tolerance: float | Array = 0.0

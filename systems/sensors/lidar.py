@@ -9,6 +9,7 @@ divergence of the beam and no limits for dark or tilted surfaces: those defaults
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any
@@ -20,10 +21,11 @@ from pydrake.geometry import FrameId, QueryObject, Role
 from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, InputPort, OutputPort, State
 
-from systems.markers.pnp import cross_matrix
+from systems.compiled import compiled, packed
 from systems.messages import Scan, whole_nanoseconds
 from systems.noise import NoiseStream
-from systems.raycasting import Solids, SolidsMemo
+from systems.raycasting import SolidsMemo
+from systems.sensors.lidar_beams import Beams, cast_beams
 from systems.sensors.sampled import SampledSensor
 from systems.validation import require, require_non_negative, require_positive
 
@@ -111,75 +113,6 @@ def turn_of(parameters: LidarParameters, *, end: float, frame_id: str) -> Scan:
     )
 
 
-def poses_before(twist: Array, ages: Array) -> Array:
-    """Returns where a body was under a steady twist, seen from where it is now.
-
-    Args:
-        twist: (6,) of the body in its own axes, rotation first (rad/s, m/s).
-        ages: (n,) how long ago, s.
-
-    Returns:
-        (n, 3, 4) rotations and translations (m): exp(-age [twist]) in SE(3) (Murray, Li, Sastry,
-        "A mathematical introduction to robotic manipulation", 1994, proposition 2.9).
-    """
-    speed = max(float(np.linalg.norm(twist[:3])), 1e-12)
-    K = cross_matrix(twist[:3] / speed)
-    angle = (-speed * ages)[:, None, None]
-    s, c = np.sin(angle), 1 - np.cos(angle)
-    poses = np.empty((len(ages), 3, 4))
-    poses[:, :, :3] = np.eye(3) + s * K + c * (K @ K)
-    V = angle * np.eye(3) + c * K + (angle - s) * (K @ K)
-    poses[:, :, 3] = V @ (twist[3:] / speed)
-    return poses
-
-
-@dataclass(frozen=True, eq=False)
-class Beams:
-    """What the beams of a turn fall on, without noise.
-
-    Attributes:
-        ranges: (n, 3) m, at the right edge, in the middle and at the left edge of each beam; inf
-            where nothing is within range_max.
-        solids: (n, 3) which solid; -1 for none.
-    """
-
-    ranges: Array
-    solids: NDArray[np.intp]
-
-
-def cast_beams(
-    scan: Scan,
-    solids: Solids,
-    X_WP: RigidTransform,
-    X_PL: RigidTransform,
-    *,
-    twist: Array,
-    divergence: float,
-) -> Beams:
-    """Returns what the beams of a turn fall on, each from where the lidar was at its time.
-
-    Args:
-        scan: the turn; its ranges are not looked at.
-        solids: what there is to be hit.
-        X_WP: pose of the body at the last ray.
-        X_PL: pose of the lidar in the body.
-        twist: (6,) of the body in its own axes, rotation first (rad/s, m/s), steady for the turn.
-        divergence: full angle of the beam, rad.
-    """
-    n = len(scan)
-    poses = poses_before(twist, scan.time_increment * np.arange(n - 1, -1, -1, dtype=float))
-    X_WB = X_WP.GetAsMatrix34()
-    R = X_WB[:, :3] @ poses[:, :, :3]
-    origins = R @ X_PL.translation() + poses[:, :, 3] @ X_WB[:, :3].T + X_WB[:, 3]
-    angles = scan.angles[:, None] + divergence * np.array([-0.5, 0.0, 0.5])
-    ahead, left = (R @ X_PL.rotation().matrix()[:, :2]).transpose(2, 0, 1)[:, :, None]
-    directions = np.cos(angles)[..., None] * ahead + np.sin(angles)[..., None] * left
-    ranges, hit = solids.first_hits(
-        np.repeat(origins, 3, axis=0), directions.reshape(-1, 3), scan.range_max
-    )
-    return Beams(ranges.reshape(n, 3), hit.reshape(n, 3))
-
-
 def incidence_cosine(ranges: Array, divergence: float) -> Array:
     """Returns the cosine of the angle between beam and surface normal, in the scan plane: (n,).
 
@@ -191,10 +124,15 @@ def incidence_cosine(ranges: Array, divergence: float) -> Array:
         ranges: (n, 3) m, as of `Beams`.
         divergence: full angle between the outer ones, rad.
     """
-    right, middle, left = ranges.T
-    with np.errstate(divide="ignore", invalid="ignore"):
-        tangent = (middle / right - middle / left) / (2 * np.sin(divergence / 2))
-    return np.where(np.isfinite(ranges).all(axis=1), 1 / np.sqrt(1 + tangent**2), np.nan)
+    return np.array([_incidence_cosine(a, b, c, divergence) for a, b, c in ranges.tolist()])
+
+
+@compiled("f8(f8, f8, f8, f8)")
+def _incidence_cosine(right: float, middle: float, left: float, divergence: float) -> float:
+    if not (math.isfinite(right) and math.isfinite(middle) and math.isfinite(left)):
+        return math.nan
+    tangent = (middle / right - middle / left) / (2 * math.sin(divergence / 2))
+    return 1 / math.sqrt(1 + tangent * tangent)
 
 
 def measured_ranges(
@@ -220,23 +158,58 @@ def measured_ranges(
     n = len(beams.ranges)
     noise = random.standard_normal(n)
     dropped, mixed, share = random.random((3, n))
-    right, ranges, left = beams.ranges.T
-    nothing = np.isinf(ranges)
-    one_solid = (beams.solids == beams.solids[:, 1:2]).all(axis=1)
-    cosine = np.where(one_solid, incidence_cosine(beams.ranges, p.beam_divergence), 1.0)
-    failed = ranges > p.range_max * np.sqrt(p.reflectivity * cosine)
-    failed |= dropped < p.dropout_probability
-    over_edge = (beams.solids[:, 0] != beams.solids[:, 2]) & np.isfinite(beams.ranges).all(axis=1)
-    over_edge &= mixed < p.mixed_share
-    with np.errstate(divide="ignore"):  # a surface at the lidar itself
-        between = 1 / (share / right + (1 - share) / left)
-    ranges = np.where(over_edge, between, ranges)
-    deviation = np.hypot(p.range_noise, p.range_noise_part * np.where(nothing, 0.0, ranges))
-    ranges = (ranges + deviation * noise).astype(np.float32).astype(float)
-    failed |= ranges < single(p.range_min)
-    ranges[ranges > single(p.range_max)] = np.inf
-    ranges[failed & ~nothing] = np.nan
+    limits = np.array(
+        (
+            single(p.range_min), p.range_max, single(p.range_max), p.range_noise,
+            p.range_noise_part, p.dropout_probability, p.reflectivity, p.beam_divergence,
+            p.mixed_share,
+        )
+    )  # fmt: skip
+    ranges = np.empty(n)
+    _measure_ranges(
+        packed(beams.ranges), np.array(beams.solids), noise, dropped, mixed, share, limits, ranges
+    )
     return ranges
+
+
+@compiled(
+    "void(f8[:,::1], i8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])",
+)
+def _measure_ranges(
+    beams: Array,
+    solids: NDArray[np.intp],
+    noise: Array,
+    dropped: Array,
+    mixed: Array,
+    share: Array,
+    limits: Array,
+    ranges: Array,
+) -> None:
+    """Writes what the lidar says of beams (n, 3) m on solids (n, 3), by (n,) random numbers each.
+
+    The limits are least range, range, the same in single precision, constant and growing noise,
+    drop-out probability, reflectivity, divergence and share of mixed beams.
+    """
+    least, reach, most, noise_least, noise_part = limits[:5]
+    dropout, reflectivity, divergence, mixed_share = limits[5:]
+    for k in range(len(beams)):
+        right, middle, left = beams[k]
+        nothing = math.isinf(middle)
+        cosine = 1.0
+        if solids[k, 0] == solids[k, 1] == solids[k, 2]:
+            cosine = _incidence_cosine(right, middle, left, divergence)
+        failed = middle > reach * math.sqrt(reflectivity * cosine) or dropped[k] < dropout
+        distance = middle
+        finite = math.isfinite(right) and math.isfinite(middle) and math.isfinite(left)
+        if solids[k, 0] != solids[k, 2] and finite and mixed[k] < mixed_share:
+            distance = 1 / (share[k] / right + (1 - share[k]) / left)
+        deviation = math.hypot(noise_least, 0.0 if nothing else noise_part * distance)
+        distance = float(np.float32(distance + deviation * noise[k]))
+        if distance < least:
+            failed = True
+        ranges[k] = math.inf if distance > most else distance
+        if failed and not nothing:
+            ranges[k] = math.nan
 
 
 class Lidar(SampledSensor):

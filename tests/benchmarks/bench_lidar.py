@@ -24,7 +24,8 @@ from pydrake.systems.framework import DiagramBuilder
 from pydrake.systems.sensors import CameraInfo
 
 from systems.raycasting import solids_from_inspector
-from systems.sensors.lidar import Lidar, LidarParameters, cast_beams, turn_of
+from systems.sensors.lidar import Lidar, LidarParameters, turn_of
+from systems.sensors.lidar_beams import cast_beams
 from tests.benchmarks.table import Row, show
 
 Array = NDArray[np.float64]

@@ -31,15 +31,13 @@ from systems.messages import Scan
 from systems.raycasting import Solids
 from systems.scans import scan_points
 from systems.sensors.lidar import (
-    Beams,
     Lidar,
     LidarParameters,
-    cast_beams,
     incidence_cosine,
     measured_ranges,
-    poses_before,
     turn_of,
 )
+from systems.sensors.lidar_beams import Beams, cast_beams, poses_before
 
 EXACT = LidarParameters(
     range_noise=0.0, range_noise_part=0.0, dropout_probability=0.0, mixed_share=0.0
