@@ -85,13 +85,15 @@ class ClearanceMonitor(LeafSystem):
         require_positive(rate=rate)
         n = len(moving_radii)
         self._footprint = footprint
-        self._standing = standing
-        self._moving = PlanarShapes(
+        cylinders = PlanarShapes(
             centres=np.zeros((n, 2)),
             headings=np.zeros(n),
             sizes=np.zeros((n, 2)),
             radii=moving_radii,
         )
+        self._obstacles = PlanarShapes.joined([standing, cylinders])
+        self._standing_centres = standing.centres
+        self._moving = n > 0
         self._tolerance = tolerance
         self._release = release
         count = len(standing) + n
@@ -135,13 +137,12 @@ class ClearanceMonitor(LeafSystem):
     def _calc_distances(self, context: Context, output: Any) -> None:
         if output.size() == 0:
             return
-        robot = self._footprint.moved(self._pose_input.Eval(context))
-        obstacles = self._standing
-        if len(self._moving):
-            centres = self._moving_input.Eval(context).reshape(-1, 2)
-            obstacles = PlanarShapes.joined([obstacles, self._moving.at(centres)])
-        distances = robot.distances(obstacles).min(axis=0)
-        output.SetFromVector(distances)
+        obstacles = self._obstacles
+        if self._moving:
+            moving = self._moving_input.Eval(context).reshape(-1, 2)
+            obstacles = obstacles.at(np.concatenate([self._standing_centres, moving]))
+        pose = self._pose_input.Eval(context)
+        output.SetFromVector(self._footprint.clearances(obstacles, pose))
 
     def _calc_clearance(self, context: Context, output: Any) -> None:
         distances = self._distances_output.Eval(context)

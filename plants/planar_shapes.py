@@ -22,6 +22,10 @@ from systems.compiled import compiled, packed
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 
+# Centres, turns, corners, halves and radii, for compiled code.
+_Cores = tuple[ComplexArray, ComplexArray, ComplexArray, Array, Array]
+_CORES = "Tuple((c16[::1], c16[::1], c16[:,::1], f8[:,::1], f8[::1]))"
+
 _CORNERS = np.array([1 + 1j, -1 + 1j, -1 - 1j, 1 - 1j])
 
 
@@ -58,6 +62,11 @@ class PlanarShapes:
 
     def __len__(self) -> int:
         return len(self._centres)
+
+    @property
+    def centres(self) -> Array:
+        """Where they are, (n, 2) m."""
+        return np.column_stack([self._centres.real, self._centres.imag])
 
     @property
     def radii(self) -> Array:
@@ -107,11 +116,24 @@ class PlanarShapes:
         It is negative where they overlap, by the length of the shortest push that parts them.
         """
         distances = np.empty((len(self), len(others)))
-        _distances(*self._cores, *others._cores, distances)
+        _distances(self._cores, others._cores, distances)
         return distances
 
+    def clearances(self, others: PlanarShapes, pose: Array) -> Array:
+        """Returns how far the nearest of the shapes is from each of the others, (m,) m.
+
+        As `moved(pose).distances(others).min(axis=0)`, but in one step.
+
+        Args:
+            others: m shapes, in the world.
+            pose: (3,) [x (m), y (m), theta (rad)] of the body in whose frame the shapes are given.
+        """
+        clearances = np.empty(len(others))
+        _clearances(packed(pose), self._cores, others._cores, clearances)
+        return clearances
+
     @property
-    def _cores(self) -> tuple[ComplexArray, ComplexArray, ComplexArray, Array, Array]:
+    def _cores(self) -> _Cores:
         return self._centres, self._turns, self._corners, self._halves, self._radii
 
     def distances_from(self, points: Array) -> Array:
@@ -127,23 +149,10 @@ class PlanarShapes:
         return np.asarray(outside + np.minimum(np.maximum(x, y), 0) - self._radii[:, None])
 
 
-@compiled(
-    "void(c16[::1], c16[::1], c16[:,::1], f8[:,::1], f8[::1],"
-    " c16[::1], c16[::1], c16[:,::1], f8[:,::1], f8[::1], f8[:,::1])"
-)
-def _distances(
-    centres: ComplexArray,
-    turns: ComplexArray,
-    corners: ComplexArray,
-    halves: Array,
-    radii: Array,
-    other_centres: ComplexArray,
-    other_turns: ComplexArray,
-    other_corners: ComplexArray,
-    other_halves: Array,
-    other_radii: Array,
-    distances: Array,
-) -> None:
+@compiled(f"void({_CORES}, {_CORES}, f8[:,::1])")
+def _distances(cores: _Cores, others: _Cores, distances: Array) -> None:
+    centres, turns, corners, halves, radii = cores
+    other_centres, other_turns, other_corners, other_halves, other_radii = others
     for i in range(len(centres)):
         for j in range(len(other_centres)):
             between = other_centres[j] - centres[i]
@@ -155,6 +164,17 @@ def _distances(
             if gap > 0:
                 gap = min(apart, apart_back)
             distances[i, j] = gap - radii[i] - other_radii[j]
+
+
+@compiled(f"void(f8[::1], {_CORES}, {_CORES}, f8[::1])")
+def _clearances(pose: Array, cores: _Cores, others: _Cores, clearances: Array) -> None:
+    centres, turns, corners, halves, radii = cores
+    turn, shift = complex(math.cos(pose[2]), math.sin(pose[2])), complex(pose[0], pose[1])
+    distances = np.empty((len(centres), len(clearances)))
+    moved = (centres * turn + shift, turns * turn, corners * turn, halves, radii)
+    _distances(moved, others, distances)
+    for j in range(len(clearances)):
+        clearances[j] = distances[:, j].min()
 
 
 @compiled()

@@ -86,10 +86,30 @@ def test_many_at_once_are_as_one_by_one_and_no_frame_is_special() -> None:
     )
 
 
+def test_clearances_are_the_least_distances_of_a_body_at_its_pose() -> None:
+    rng = np.random.default_rng(1)
+    body, others = random_shapes(rng, 4), random_shapes(rng, 9)
+    for pose in rng.uniform(-4, 4, (50, 3)):
+        expected = body.moved(pose).distances(others).min(axis=0)
+        np.testing.assert_allclose(body.clearances(others, pose), expected, atol=1e-12)
+    # By hand: turned to the left, the disc ahead of the centre is at (1, 4).
+    dumbbell = PlanarShapes.joined([disc(0, 0, 0.5), disc(2, 0, 0.25)])
+    pose = np.array([1.0, 2.0, math.pi / 2])
+    found = dumbbell.clearances(PlanarShapes.joined([disc(1, 6, 1.0), disc(1, -1, 1.0)]), pose)
+    np.testing.assert_allclose(found, [0.75, 1.5])
+
+
+def test_centres_are_given_back() -> None:
+    centres = np.array([[1.0, -2.0], [0.5, 3.0]])
+    shapes = PlanarShapes(centres=centres, headings=[0, 1], sizes=np.ones((2, 2)), radii=[0, 1])
+    np.testing.assert_array_equal(shapes.centres, centres)
+
+
 def test_no_shape_has_no_distances() -> None:
     none = PlanarShapes.joined([])
     assert len(none) == 0
     assert UNIT.distances(none).shape == (1, 0)
+    assert UNIT.clearances(none, np.zeros(3)).shape == (0,)
     assert none.distances_from(np.zeros((2, 2))).shape == (0, 2)
 
 
