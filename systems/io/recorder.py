@@ -82,6 +82,7 @@ class _Tap:
         port: where it is looked at.
         topic: see `Channel`.
         encode: makes its messages.
+        is_vector: see `Channel`.
         only_new: see `Channel`.
         repeat: see `Channel`.
         stamp: of the last message, s.
@@ -92,6 +93,7 @@ class _Tap:
     port: InputPort
     topic: str
     encode: Encoder
+    is_vector: bool
     only_new: bool
     repeat: float
     stamp: float = math.nan
@@ -186,7 +188,14 @@ class Recorder(LeafSystem):
                 else self.DeclareAbstractInputPort(channel.port, AbstractValue.Make(channel.model))
             )
             encode = encoder(channel.encode) if isinstance(channel.encode, str) else channel.encode
-            tap = _Tap(port, channel.topic, encode, channel.only_new, channel.repeat)
+            tap = _Tap(
+                port=port,
+                topic=channel.topic,
+                encode=encode,
+                is_vector=channel.is_vector,
+                only_new=channel.only_new,
+                repeat=channel.repeat,
+            )
             groups.setdefault(channel.rate, []).append(tap)
             _make_serialiser(channel, encode)
         self.DeclareInitializationPublishEvent(self._record_static)
@@ -223,7 +232,8 @@ class Recorder(LeafSystem):
             value = tap.port.Eval(context)
             if tap.is_due(value, t):
                 # Of a pose Drake shows the one in its cache, which will change.
-                self._waiting.append((tap, copy(value), t))
+                kept = value.copy() if tap.is_vector else copy(value)
+                self._waiting.append((tap, kept, t))
         chunk = self._writer.chunk(t)
         if chunk != self._chunk:
             self._chunk = chunk

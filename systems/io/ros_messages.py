@@ -9,16 +9,20 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from systems.io import ros_flow, ros_motion, ros_scan, ros_vision
+from systems.io.ros_detections import serialised_detections
 from systems.validation import nearest
 
 Encoder = Callable[[Any, float], Any]
-"""Makes the ROS message of a port's value, and of the time for values that carry none (s)."""
+"""Makes the ROS message of a port's value, and of the time for values that carry none (s).
+
+As an object, or as bytes already (`systems.io.stencils.SerialisedMessage`).
+"""
 
 Decoder = Callable[[Any], Any]
 """Makes our value of a ROS message, of ROS 2 or ROS 1."""
 
 ENCODERS: Mapping[str, Encoder] = {
-    "apriltag_msgs/msg/AprilTagDetectionArray": lambda v, _: ros_vision.detections_to_ros(v),
+    "apriltag_msgs/msg/AprilTagDetectionArray": lambda v, _: serialised_detections(v),
     "geometry_msgs/msg/PoseStamped": lambda v, t: ros_motion.pose_to_ros(
         v, stamp=t, frame_id="map"
     ),

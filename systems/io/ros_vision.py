@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.cameras import PinholeCamera
+from systems.compiled import compiled, in_rows
 from systems.io.ros_types import header, message_class, time_from_ros
 from systems.markers.family import family as family_named
 from systems.messages import CameraImage, Detections
@@ -211,18 +212,24 @@ def homographies(corners: Array) -> Array:
 
     Source: Heckbert, "Fundamentals of texture mapping and image warping", 1989, section 2.2.3.
     """
-    a, b, c, d = corners.transpose(1, 0, 2)
-    p, q, s = b - c, d - c, a - b + c - d
     H = np.empty((len(corners), 3, 3))
-    with np.errstate(all="ignore"):
-        g, h = np.array([_cross(s, q), _cross(p, s)]) / _cross(p, q)
-        # From the unit square it would be [u v a; g h 1]; half of that, from its middle.
-        u, v = b - a + g[:, None] * b, d - a + h[:, None] * d
-        H[:, :2, 0], H[:, :2, 1], H[:, :2, 2] = u / 2, v / 2, a + (u + v) / 2
-        H[:, 2, 0], H[:, 2, 1], H[:, 2, 2] = g / 2, h / 2, 1 + (g + h) / 2
-        H /= H[:, 2:, 2:]
+    _homographies(in_rows(corners, 4, 2), H)
     return H
 
 
-def _cross(a: Array, b: Array) -> Array:
-    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+@compiled("void(f8[:,:,::1], f8[:,:,::1])")
+def _homographies(corners: Array, H: Array) -> None:
+    for n in range(len(corners)):
+        (ax, ay), (bx, by), (cx, cy), (dx, dy) = corners[n]
+        px, py, qx, qy = bx - cx, by - cy, dx - cx, dy - cy
+        sx, sy = ax - bx + cx - dx, ay - by + cy - dy
+        area = px * qy - py * qx
+        g, h = (sx * qy - sy * qx) / area, (px * sy - py * sx) / area
+        # From the unit square it would be [u v a; g h 1]; half of that, from its middle.
+        scale = 1 + (g + h) / 2
+        for i in range(2):
+            a, b, d = corners[n, 0, i], corners[n, 1, i], corners[n, 3, i]
+            u, v = b - a + g * b, d - a + h * d
+            H[n, i, 0], H[n, i, 1] = u / 2 / scale, v / 2 / scale
+            H[n, i, 2] = (a + (u + v) / 2) / scale
+        H[n, 2, 0], H[n, 2, 1], H[n, 2, 2] = g / 2 / scale, h / 2 / scale, 1.0

@@ -419,12 +419,16 @@ class Localizer(LeafSystem):
         return self._counts.output_port
 
     def _locate(self, context: Context) -> Localization:
-        detections = self._detections_input.Eval(context)
-        return self._memo(context, self._localizer.locate, detections)
+        return self._located(context, self._detections_input.Eval(context))
+
+    def _located(self, context: Context, detections: Detections) -> Localization:
+        found: Localization = self._memo(context, self._localizer.locate, detections)
+        return found
 
     def _count(self, context: Context, discrete_state: DiscreteValues) -> None:
         detections = self._detections_input.Eval(context)
         last_stamp = context.get_discrete_state(self._last_stamp)[0]
-        if np.isfinite(detections.stamp) and detections.stamp != last_stamp:
+        if math.isfinite(detections.stamp) and detections.stamp != last_stamp:
             discrete_state.set_value(self._last_stamp, [detections.stamp])
-            self._counts.add(context, discrete_state, **self._locate(context).dropped)
+            dropped = self._located(context, detections).dropped
+            self._counts.add(context, discrete_state, **dropped)
