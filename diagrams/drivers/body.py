@@ -5,7 +5,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 
-import numpy as np
 from pydrake.systems.framework import BasicVector, OutputPort
 from pydrake.systems.primitives import Integrator, MatrixGain, PassThrough
 
@@ -51,9 +50,9 @@ class WheeledBody(ABC):
     def add_model(self, station: StationBuilder, robot: Robot) -> None:
         """Adds the robot to the plant, at its start."""
 
-    def to_wheel_speeds(self, command: np.ndarray) -> list[float]:
+    def to_wheel_speeds(self, command: list[float]) -> list[float]:
         """Returns [right, left] (rad/s) of a command [v, omega]."""
-        return wheel_speeds(command.tolist(), self.sides)
+        return wheel_speeds(command, self.sides)
 
     def add_state(self, station: StationBuilder, robot: Robot) -> None:
         """Adds what says where the robot is and takes its wheel speeds; exports the truth."""

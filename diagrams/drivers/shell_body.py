@@ -81,7 +81,7 @@ class SnailBotBody:
     carries_shell: bool = False
     shell: ShellParameters = field(default_factory=ShellParameters)
 
-    def to_wheel_speeds(self, command: np.ndarray) -> list[float]:
+    def to_wheel_speeds(self, command: list[float]) -> list[float]:
         """Returns [right, left] (rad/s) of a command [v, omega]."""
         return wheel_speeds(command, self.parameters, self.shell)
 

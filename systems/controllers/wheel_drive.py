@@ -7,14 +7,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
 from systems.validation import require, require_non_negative, require_positive
-
-Array = NDArray[np.float64]
 
 
 @dataclass
@@ -77,7 +73,7 @@ class WheelDrive(LeafSystem):
     def __init__(
         self,
         *,
-        to_wheel_speeds: Callable[[Array], list[float]],
+        to_wheel_speeds: Callable[[list[float]], list[float]],
         parameters: WheelDriveParameters | None = None,
         max_wheel_speed: float = math.inf,
     ) -> None:
@@ -125,23 +121,21 @@ class WheelDrive(LeafSystem):
         sent: list[float] = context.get_discrete_state(self._sent).get_value().tolist()
         if not (any(sent) or any(command)):
             return  # it stands: most robots of a formation do, most of the time
-        limited = map(_within, command, self._limit)
-        wanted = self._within_reach(list(limited))
-        steps = (
-            now + _within(then - now, change)
-            for now, then, change in zip(sent, wanted, self._change, strict=True)
-        )
+        (max_v, max_omega), (dv, domega) = self._limit, self._change
+        v, omega = self._within_reach(_within(command[0], max_v), _within(command[1], max_omega))
+        v = sent[0] + _within(v - sent[0], dv)
+        omega = sent[1] + _within(omega - sent[1], domega)
         # Once more: on its way from one to the other it may leave what the wheels can do.
-        discrete_state.set_value(self._sent, self._within_reach(list(steps)))
+        discrete_state.set_value(self._sent, self._within_reach(v, omega))
 
-    def _within_reach(self, command: list[float]) -> list[float]:
+    def _within_reach(self, v: float, omega: float) -> list[float]:
         if math.isinf(self._max_wheel_speed):
-            return command
-        fastest = max(map(abs, self._to_wheel_speeds(np.array(command))))
+            return [v, omega]
+        right, left = self._to_wheel_speeds([v, omega])
+        fastest = max(abs(right), abs(left))
         factor = min(1.0, self._max_wheel_speed / max(fastest, 1e-9))
-        return [value * factor for value in command]
+        return [v * factor, omega * factor]
 
     def _calc_wheel_speeds(self, context: Context, output: Any) -> None:
-        output.SetFromVector(
-            self._to_wheel_speeds(context.get_discrete_state(self._sent).get_value())
-        )
+        sent = context.get_discrete_state(self._sent).get_value().tolist()
+        output.SetFromVector(self._to_wheel_speeds(sent))

@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 
 def length_of(points: Array) -> float:
     """Returns the length of a path (n, 2), m; 0 for one without a piece."""
-    steps = np.diff(points, axis=0)
-    return float(np.hypot(steps[:, 0], steps[:, 1]).sum()) if len(steps) else 0.0
+    places = points.tolist()
+    return float(sum(map(math.dist, places, places[1:])))
 
 
 def rest_of(points: Array, position: Array) -> Array:

@@ -46,9 +46,9 @@ def left_to_go(points: Array, position: Array, goal: Array) -> float:
         goal: (2,) m.
     """
     if len(points) == 0:
-        return float(np.hypot(*(goal - position)))
-    rest = np.concatenate([position[None], rest_of(points, position), goal[None]])
-    return length_of(rest)
+        return math.dist(position, goal)
+    rest = rest_of(points, position)
+    return math.dist(position, rest[0]) + length_of(rest) + math.dist(rest[-1], goal)
 
 
 class ProgressMonitor(LeafSystem):
@@ -128,15 +128,16 @@ class ProgressMonitor(LeafSystem):
         path = np.zeros((0, 2))
         if self._path_input.HasValue(context):
             path = self._path_input.Eval(context).points
-        *old_goal, best, since, most = context.get_discrete_state(self._best).get_value()
-        bad_pose, bad_goal = not np.isfinite(position).all(), not np.isfinite(goal).all()
-        bad_path = not np.isfinite(path).all()
+        *old_goal, best, since, most = context.get_discrete_state(self._best).get_value().tolist()
+        bad_pose, bad_goal, bad_path = (
+            not np.isfinite(values).all() for values in (position, goal, path)
+        )
         self._counts.add(
             context, discrete_state, bad_pose=bad_pose, bad_goal=bad_goal, bad_path=bad_path
         )
         if bad_goal:
             goal = np.array(old_goal)
-        elif not np.array_equal(goal, old_goal):
+        elif goal.tolist() != old_goal:
             best, since, most = math.inf, now, 0.0
         if math.isnan(since):  # there has been no waypoint yet
             return
@@ -147,5 +148,5 @@ class ProgressMonitor(LeafSystem):
             most = max(most, left)
         detour = most - best if math.isfinite(best) else 0.0
         stuck = now - since > p.patience + detour / p.slowest
-        discrete_state.set_value(self._best, [*goal, best, since, most])
+        discrete_state.set_value(self._best, [*goal.tolist(), best, since, most])
         discrete_state.set_value(self._stuck, [1.0 if stuck else 0.0])

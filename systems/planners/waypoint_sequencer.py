@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -76,8 +77,8 @@ class WaypointSequencer(LeafSystem):
     def _look_at_arrival(self, context: Context, discrete_state: DiscreteValues) -> None:
         index = int(context.get_discrete_state(self._reached)[0])
         if index < len(self._waypoints):
-            offset = self._waypoints[index] - self._pose_input.Eval(context)[:2]
-            if np.hypot(*offset) < self._radius:
+            position = self._pose_input.Eval(context)[:2]
+            if math.dist(self._waypoints[index], position) < self._radius:
                 discrete_state.set_value(self._reached, [index + 1.0])
 
     def _calc_goal(self, context: Context, output: Any) -> None:
