@@ -182,13 +182,16 @@ class MotorModel:
             speed: of the wheel, rad/s.
         """
         p = self.parameters
-        emf = self.back_emf * np.abs(np.asarray(speed, float))
-        if p.chopped == "enable":
-            left = np.maximum(p.battery_voltage - p.bridge_voltage - emf, self._voltage_lost)
-            size = self._voltage_lost / left
-        else:
-            size = (emf + p.bridge_voltage + self._voltage_lost) / p.battery_voltage
-        return np.asarray(np.sign(speed) * np.minimum(size, 1.0))
+        emf = np.asarray(self.back_emf * np.asarray(speed, float))
+        duties = []
+        for e in emf.ravel().tolist():  # of two wheels, mostly: too few for NumPy to be quick
+            if p.chopped == "enable":
+                left = max(p.battery_voltage - p.bridge_voltage - abs(e), self._voltage_lost)
+                size = self._voltage_lost / left
+            else:
+                size = (abs(e) + p.bridge_voltage + self._voltage_lost) / p.battery_voltage
+            duties.append(math.copysign(min(size, 1.0), e) if e else 0.0)
+        return np.array(duties).reshape(emf.shape)
 
 
 @compiled("void(f8[::1], f8[::1], f8[::1], f8[::1], f8[::1])")

@@ -330,14 +330,13 @@ class Avoider(LeafSystem):
         twist: Array,
     ) -> tuple[float, Array]:
         """Adds to the trail; returns by how much the robot turned since the last time, and it."""
-        trail = context.get_discrete_state(self._trail).get_value().reshape(-1, 4)
+        trail = discrete_state.get_mutable_value(self._trail).reshape(-1, 4)
         last = context.get_discrete_state(self._last).get_value()
         dt = now - float(trail[-1, 0])
         step = np.zeros(3)
         if math.isfinite(dt):
             step = step_between(last, pose, twist, dt)
-        trail = extend(trail, now, step)
-        discrete_state.set_value(self._trail, trail.ravel())
+        trail[:] = extend(trail, now, step)
         if all(map(math.isfinite, pose.tolist())):
             discrete_state.set_value(self._last, pose)
         return float(step[2]), trail

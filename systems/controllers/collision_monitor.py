@@ -252,11 +252,11 @@ class CollisionMonitor(LeafSystem):
         if bad_sent:
             sent = last_sent
         # Dead reckoning in a frame of its own, from where it was switched on.
-        trail = context.get_discrete_state(self._trail).get_value().reshape(-1, 4)
+        trail = discrete_state.get_mutable_value(self._trail).reshape(-1, 4)
         pose = np.zeros(3)
         if not math.isnan(trail[-1, 0]):
             pose = move(trail[-1, 1:], (last_sent + sent) / 2, now - float(trail[-1, 0]))
-        trail = remember(trail, now, pose)
+        trail[:] = remember(trail, now, pose)
 
         fault = scan_fault(scan, now, self._parameters.max_scan_age)
         bad_command = not all(map(math.isfinite, command.tolist()))
@@ -277,7 +277,6 @@ class CollisionMonitor(LeafSystem):
             last_stamp = scan.stamp
         discrete_state.set_value(self._held, allowed)
         discrete_state.set_value(self._memory, [scale, last_stamp, *sent.tolist()])
-        discrete_state.set_value(self._trail, trail.ravel())
         counts = {fault: 1} if fault else {}
         if bad_command or bad_sent:
             counts["bad_command"] = 1

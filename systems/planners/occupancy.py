@@ -352,12 +352,11 @@ class OccupancyMapper(LeafSystem):
 
     def _look(self, context: Context, state: State) -> EventStatus:
         discrete_state: Any = state.get_mutable_discrete_state()
-        trail = context.get_discrete_state(self._trail).get_value().reshape(-1, 4)
+        trail = discrete_state.get_mutable_value(self._trail).reshape(-1, 4)
         pose = self._pose_input.Eval(context)
         bad_pose = not all(map(math.isfinite, pose.tolist()))
         if not bad_pose:
-            trail = remember(trail, context.get_time(), pose)
-            discrete_state.set_value(self._trail, trail.ravel())
+            trail[:] = remember(trail, context.get_time(), pose)
         counts = {"bad_pose": int(bad_pose)}
         scan = self._scan_input.Eval(context)
         last_stamp = context.get_discrete_state(self._last_stamp)[0]
