@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from systems.messages import Scan
-from systems.pose_trail import empty_trail, poses_at, ray_poses, remember
+from systems.pose_trail import empty_trail, poses_at, ray_ends, ray_poses, remember
 
 
 def test_a_trail_reaches_back_as_far_as_it_is_to() -> None:
@@ -31,6 +32,20 @@ def test_an_empty_trail_knows_nothing() -> None:
     assert np.isnan(poses_at(empty_trail(duration=1.0, rate=10.0), np.zeros(2))).all()
 
 
+def test_it_is_what_numpy_interpolates_over_several_turns_and_gaps() -> None:
+    random = np.random.default_rng(4)
+    times = np.cumsum(random.uniform(0.05, 0.2, 20))
+    poses = np.cumsum(random.normal(0, 1.0, (20, 3)), axis=0)  # theta runs over several turns
+    trail = np.column_stack([times, poses[:, :2], np.arctan2(np.sin(poses), np.cos(poses))[:, 2]])
+    trail[[3, 11], [1, 3]] = np.nan
+    known = np.isfinite(trail).all(axis=1)
+    asked = random.uniform(times[0] - 0.3, times[-1] + 0.3, 200)  # in no order
+    found = poses_at(trail, asked)
+    unwrapped = np.unwrap(trail[known, 3])
+    for k, column in enumerate((*trail[known, 1:3].T, unwrapped)):
+        np.testing.assert_allclose(found[:, k], np.interp(asked, times[known], column), atol=1e-12)
+
+
 def test_each_ray_starts_where_the_lidar_was() -> None:
     # Turning in place by a quarter in a second; the lidar sits 0.1 m ahead and looks to the left.
     trail = remember(empty_trail(duration=1.0, rate=10.0), 0.0, np.zeros(3))
@@ -47,3 +62,13 @@ def test_each_ray_starts_where_the_lidar_was() -> None:
         theta = math.pi / 2 * i / 4
         expected = [0.1 * math.cos(theta), 0.1 * math.sin(theta)]
         assert found[i] == pytest.approx([*expected, theta + math.pi / 2 - 0.2 + 0.1 * i])
+
+
+def test_a_ray_ends_where_it_hit_and_only_then() -> None:
+    ranges = np.array([2.0, np.inf, np.nan, 0.1, 9.0, 0.5, 8.0])
+    scan = Scan(stamp=0.0, range_min=0.15, range_max=8.0, ranges=ranges)
+    rays = np.column_stack([np.ones(7), np.full(7, -1.0), np.radians([90, 0, 0, 0, 0, 180, 0])])
+    expected = [[1.0, 1.0], [0.5, -1.0], [9.0, -1.0]]
+    np.testing.assert_allclose(ray_ends(scan, rays), expected, atol=1e-12)
+    endless = replace(scan, range_max=np.inf)
+    assert len(ray_ends(endless, rays)) == 4  # not where there is nothing

@@ -96,6 +96,15 @@ def test_ways_are_as_short_as_dijkstras(seed: int) -> None:
     assert found
 
 
+def test_a_way_far_off_on_rough_ground_is_found_with_thousands_of_places_waiting() -> None:
+    # So dear that the heuristic says little: nearly every cell is looked at first.
+    cost = 1 + np.random.default_rng(0).exponential(30.0, (150, 150))
+    way = shortest_way(cost, (75, 75), (2, 140))
+    assert way is not None
+    least = dijkstra(cost, (75, 75))[2, 140]
+    assert least * (1 - 1e-9) <= cost_of(way, cost) <= least * 1.001
+
+
 def test_known_lengths() -> None:
     cost = np.ones((20, 30))
     way = shortest_way(cost, (2, 3), (2, 23))

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -131,6 +132,26 @@ def test_what_is_clear() -> None:
     near = np.array([1.3, 1.5])
     assert is_clear(costs, np.array([near, [1.3, 2.0], [1.0, 2.0]]), near, 0.15)
     assert not is_clear(costs, np.array([near, [1.38, 1.5]]), near, 0.15)
+
+
+@pytest.mark.parametrize("radius", [0.05, 0.15, 0.33])
+def test_what_is_clear_is_so_on_the_map_of_clearances(radius: float) -> None:
+    random = np.random.default_rng(1)
+    cells = np.where(random.random((60, 60)) < 0.02, 3.5, -2.0).astype(np.float32)
+    costs = cost_map(OccupancyGrid(stamp=0.0, resolution=0.05, log_odds=cells), radius=radius)
+    verdicts = []
+    for _ in range(300):
+        points = random.uniform(-0.5, 3.5, 2) + np.cumsum(random.normal(0, 0.3, (3, 2)), axis=0)
+        fine = np.concatenate([np.linspace(a, b, 2000) for a, b in pairwise(points)])
+        here, least = (costs.at(p, costs.clearance).min() for p in (points[:1], fine))
+        verdict = is_clear(costs, points, points[0], radius)
+        # Looked at every half a cell: what it crosses by less it may miss.
+        if least >= min(radius, here) - 0.025:
+            assert verdict
+        if least < min(radius, here) - 0.025 - 0.05:
+            assert not verdict
+        verdicts.append(verdict)
+    assert 30 < sum(verdicts) < 270
 
 
 def test_the_steering_point_is_as_far_along_as_can_be_seen() -> None:
