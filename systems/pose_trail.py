@@ -94,9 +94,11 @@ def ray_poses(scan: Scan, lidar_pose: Array, trail: Array) -> Array:
 
 @compiled("void(f8[:,::1], f8[::1], f8[::1], f8[:,::1])")
 def _ray_poses(trail: Array, lidar_pose: Array, timing: Array, rays: Array) -> None:
-    n = len(rays)
-    _poses_at(trail, timing[0] + timing[1] * np.arange(n), rays)
-    for k in range(n):
+    times = np.empty(len(rays))
+    for k in range(len(rays)):
+        times[k] = timing[0] + timing[1] * k
+    _poses_at(trail, times, rays)
+    for k in range(len(rays)):
         c, s = math.cos(rays[k, 2]), math.sin(rays[k, 2])
         rays[k, 0] += c * lidar_pose[0] - s * lidar_pose[1]
         rays[k, 1] += s * lidar_pose[0] + c * lidar_pose[1]

@@ -86,33 +86,32 @@ def _safe_command(
     margins: Array,
 ) -> float:
     """Reduces the command to what is safe; returns by which factor its speed is scaled."""
-    one, safe = command.copy().reshape(1, 2), np.empty(3, np.bool_)
+    v, omega = command[0], command[1]
+    one, safe = np.empty((1, 2)), np.empty(3, np.bool_)
+    one[0, 0], one[0, 1] = v, omega
     mark_safe(one, sent, held, points, hull, times, margins, safe)
     if safe[0]:
         return 1.0
     first, last = 0, len(_SLOWER)
     while first < last:  # the slower, the safer
         middle = (first + last) // 2
-        one[0] = _SLOWER[middle] * command
+        one[0, 0], one[0, 1] = _SLOWER[middle] * v, _SLOWER[middle] * omega
         mark_safe(one, sent, held, points, hull, times, margins, safe)
         if safe[0]:
             last = middle
         else:
             first = middle + 1
-    if last < len(_SLOWER):
-        command *= _SLOWER[last]
-        return float(_SLOWER[last])
-    turning = command[0] != 0 and command[1] != 0
-    turns = np.zeros((3, 2))
-    turns[:, 1] = _TURNS * command[1]
-    command[:] = 0.0
-    if turning:
-        mark_safe(turns, sent, held, points, hull, times, margins, safe)
+    factor = _SLOWER[last] if last < len(_SLOWER) else 0.0
+    command[0], command[1] = factor * v, factor * omega
+    if factor == 0 and v != 0 and omega != 0:
+        turns = np.empty((3, 2))
         for k in range(3):
+            turns[k, 0], turns[k, 1] = 0.0, _TURNS[k] * omega
+        mark_safe(turns, sent, held, points, hull, times, margins, safe)
+        for k in range(2, -1, -1):
             if safe[k]:
                 command[1] = turns[k, 1]
-                break
-    return 0.0
+    return factor
 
 
 def still_hidden(remembered: Array, scan: Scan, rays: Array) -> Array:
