@@ -236,4 +236,14 @@ def test_a_correction_is_that_of_the_joseph_form() -> None:
     assert refused.state is state
 
 
+def test_an_innovation_whose_covariance_is_not_positive_is_refused() -> None:
+    state = some_state(6)
+    state = state._replace(P=1e-6 * np.eye(len(state.x)))
+    H = np.eye(3, SIZE)
+    refused = corrected(state, H, np.full(3, 1e-3), np.diag([1e-4, -1e-3, 1e-4]), math.inf)
+    assert not refused.accepted
+    assert refused.state is state
+    assert math.isnan(refused.nis)
+
+
 # --- The trail ---

@@ -50,7 +50,7 @@ def see(
     size: float = 0.2,
     camera: PinholeCamera = CAMERA,
     parameters: ProjectorParameters = EXACT,
-    solids: Solids | None = None,
+    solids: Solids | Callable[[], Solids] | None = None,
     X_WC: RigidTransform = AHEAD,
     rng: np.random.Generator | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -219,6 +219,20 @@ def test_how_close_a_solid_may_be_grows_with_the_distance() -> None:
         board = close @ RigidTransform([depth - 0.005, 0.0, 0.0])
         index, _ = see(close, size=0.01, solids=Solids([Box(0.01, 0.1, 0.1)], [board]))
         assert (len(index) == 1) is seen
+
+
+def test_what_may_hide_markers_is_asked_for_only_when_some_are_in_the_picture() -> None:
+    asked = []
+
+    def wall() -> Solids:
+        asked.append(True)
+        return Solids([Box(0.02, 2.0, 2.0)], [RigidTransform([1.0, 0.0, 0.0])])
+
+    assert see(facing(-2.0), solids=wall)[0].tolist() == []
+    assert asked == []
+    assert see(facing(2.0), solids=wall)[0].tolist() == []
+    assert asked == [True]
+    assert see(facing(2.0))[0].tolist() == [0]
 
 
 def test_a_distorted_picture_does_not_fold_back() -> None:
