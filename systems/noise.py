@@ -11,8 +11,10 @@ from __future__ import annotations
 import hashlib
 from functools import lru_cache
 from statistics import NormalDist
+from typing import Any
 
 import numpy as np
+from numpy.random.bit_generator import ISeedSequence
 from numpy.typing import NDArray
 from pydrake.systems.framework import BasicVector, Context, LeafSystem
 
@@ -28,13 +30,32 @@ def stream_key(seed: int, name: str) -> int:
     return int.from_bytes(digest, "little")
 
 
+class _Key(ISeedSequence):
+    """Hands Philox its key.
+
+    Given as `key=`, it would come to the same, but NumPy then asks the operating system for a seed
+    first, hashes it and throws it away, which takes three times as long as all the rest.
+    """
+
+    def __init__(self, key: int) -> None:
+        self._words = np.array([key % 2**64, key >> 64], np.uint64)
+
+    def generate_state(self, n_words: int, dtype: Any = np.uint32) -> NDArray[Any]:  # noqa: ARG002
+        return self._words
+
+
+@lru_cache(maxsize=1024)
+def _philox_key(key: int) -> Any:  # NumPy's stubs want a `SeedSequence`, its code the interface
+    return _Key(key)
+
+
 def generator(key: int, index: int) -> np.random.Generator:
     """Returns the random generator of sample `index` (>= 0) in the stream `key`.
 
     The index is the high half of Philox's 256-bit counter, so the numbers of different samples
     never overlap, however many are drawn for one.
     """
-    return np.random.Generator(np.random.Philox(key=key, counter=index << 128))
+    return np.random.Generator(np.random.Philox(_philox_key(key), counter=index << 128))
 
 
 @lru_cache(maxsize=1024)

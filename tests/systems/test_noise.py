@@ -27,6 +27,15 @@ def test_a_draw_depends_on_nothing_but_seed_name_and_index() -> None:
     np.testing.assert_array_equal(draw(3, "imu", 7), first)
 
 
+@pytest.mark.parametrize("key", [0, 1, 2**64 - 1, 2**64, 2**128 - 1, stream_key(3, "imu")])
+@pytest.mark.parametrize("index", [0, 1, 12345, 2**64 + 7])
+def test_the_generator_is_philox_of_that_key_and_counter(key: int, index: int) -> None:
+    plain = np.random.Generator(np.random.Philox(key=key, counter=index << 128))
+    ours = generator(key, index)
+    np.testing.assert_array_equal(ours.standard_normal(50), plain.standard_normal(50))
+    np.testing.assert_array_equal(ours.random(50), plain.random(50))
+
+
 def test_a_draw_is_the_same_in_another_process() -> None:
     # Python's own hash of a string is not: it is salted.
     code = (
