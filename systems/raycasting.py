@@ -8,7 +8,6 @@ Touching a solid without entering it may count as a hit or as a miss: rounding d
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Collection, Sequence
 from typing import Any, Self
@@ -111,7 +110,8 @@ class Solids:
 
     def _carried(self, X: Array, motions: Index) -> Solids:
         """Returns the solids, each carried along by one of the motions."""
-        carried = copy.copy(self)
+        carried = Solids.__new__(Solids)
+        carried.__dict__ |= self.__dict__
         carried._centres = np.empty_like(self._centres)
         carried._to_unit = np.empty_like(self._to_unit)
         _carry(
