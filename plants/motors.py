@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
-from systems.compiled import compiled, in_rows, packed
+from systems.compiled import compiled, packed
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -150,7 +150,8 @@ class MotorModel:
             np.asarray(duty, float), np.asarray(speed, float), self.back_emf
         )
         currents = np.empty(d.size)
-        _currents(in_rows(d), in_rows(w), in_rows(k_e), self.figures, currents)
+        duties, speeds, constants = (values.flatten() for values in (d, w, k_e))
+        _currents(duties, speeds, constants, self.figures, currents)
         return currents.reshape(d.shape)
 
     def torque(self, duty: ArrayLike, speed: ArrayLike) -> Array:

@@ -7,7 +7,7 @@ than rendering a picture and searching it: 40 to 80 times at 640x480 pixels and 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,7 +41,7 @@ def project_markers(
     cells: int,
     parameters: ProjectorParameters,
     random: np.random.Generator,
-    solids: Solids | None = None,
+    solids: Solids | Callable[[], Solids] | None = None,
 ) -> tuple[NDArray[np.intp], Array]:
     """Returns which markers are found and where their corners are found.
 
@@ -55,7 +55,7 @@ def project_markers(
         cells: cells along a side of the black square.
         parameters: limits, noise and misses.
         random: where the noise comes from.
-        solids: what may stand before the markers.
+        solids: see `visible_markers`.
 
     Returns:
         (m,) index of the markers, ascending, and (m, 4, 2) px.
@@ -217,7 +217,7 @@ class MarkerProjector(SampledSensor):
             cells=self._family.cells,
             parameters=self._parameters,
             random=self._noise.generator(context, index),
-            solids=self._solids(context, query_object),
+            solids=lambda: self._solids(context, query_object),
         )
         return Detections(
             stamp=stamp,

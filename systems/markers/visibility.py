@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +25,6 @@ Index = NDArray[np.intp]
 # part of the distance from the camera, whichever is more.
 _BOARD = 1e-3
 _BOARD_PART = 0.005
-_NO_SOLIDS = Solids([], [])
 # Corners, centre, and corners again, to become those of the white margin.
 _OUTLINE = np.concatenate([marker_corners(1.0), np.zeros((1, 3)), marker_corners(1.0)])
 
@@ -105,7 +105,7 @@ def visible_markers(
     sizes: Array,
     cells: int,
     parameters: ProjectorParameters,
-    solids: Solids | None = None,
+    solids: Solids | Callable[[], Solids] | None = None,
 ) -> VisibleMarkers:
     """Projects the markers that a detector could find.
 
@@ -120,7 +120,8 @@ def visible_markers(
         sizes: (n,) sides of the black squares, m.
         cells: cells along a side of the black square.
         parameters: limits.
-        solids: what may stand before the markers.
+        solids: what may stand before the markers, or what gives it: asked only when there is one
+            to hide, for in most pictures of many robots there is none.
     """
     n, p = len(sizes), parameters
     outline = _OUTLINE.copy()
@@ -131,23 +132,25 @@ def visible_markers(
             p.max_range, p.min_side_px, p.border_px,
         )
     )  # fmt: skip
-    index, pixels, side, cosine = (
-        np.empty(n, np.intp),
-        np.empty((n, 4, 2)),
-        np.empty(n),
-        np.empty(n),
-    )
+    index, pixels, points = np.empty(n, np.intp), np.empty((n, 4, 2)), np.empty((n, 5, 3))
+    side, distance, cosine = np.empty(n), np.empty(n), np.empty(n)
+    pose = in_rows(X_WC.GetAsMatrix34(), 4)
     m = _find(
-        in_rows(X_WC.GetAsMatrix34(), 4), in_rows(X_WM, 3, 4), packed(sizes), outline,
-        *camera.matrices, limits, (_NO_SOLIDS if solids is None else solids).arrays,
-        index, pixels, side, cosine,
+        pose, in_rows(X_WM, 3, 4), packed(sizes), outline, *camera.matrices, limits,
+        index, pixels, points, side, distance, cosine,
     )  # fmt: skip
-    return VisibleMarkers(index[:m], pixels[:m], side[:m], np.arccos(cosine[:m]))
+    seen = np.arange(m)
+    if m and solids is not None:
+        hidden = np.empty(m, bool)
+        standing = solids() if callable(solids) else solids
+        _hide(standing.arrays, pose, points[:m], distance[:m], hidden)
+        seen = seen[~hidden]
+    return VisibleMarkers(index[seen], pixels[seen], side[seen], np.arccos(cosine[seen]))
 
 
 @compiled(
     "i8(f8[:,::1], f8[:,:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[::1],"
-    f" {SOLID_ARRAYS}, i8[::1], f8[:,:,::1], f8[::1], f8[::1])"
+    " i8[::1], f8[:,:,::1], f8[:,:,::1], f8[::1], f8[::1], f8[::1])"
 )
 def _find(
     X_WC: Array,
@@ -157,13 +160,14 @@ def _find(
     K: Array,
     D: Array,
     limits: Array,
-    solids: SolidArrays,
     index: Index,
     pixels: Array,
+    points: Array,
     side: Array,
+    distance: Array,
     cosine: Array,
 ) -> int:
-    """Projects the markers that can be seen, and returns how many, m, they are.
+    """Projects the markers that can be seen if nothing hides them, and returns how many they are.
 
     Args:
         X_WC: (3, 4).
@@ -174,19 +178,17 @@ def _find(
         D: (5,).
         limits: width (px), height (px), radius of the distortion's fold, cosine of the incidence,
             range (m), narrow side (px), border (px).
-        solids: what may stand before the markers.
-        index: (n,) the first m written, as of the next three: which markers.
+        index: (n,) the first of them written, as of all that follow: which markers.
         pixels: (n, 4, 2) corners, px.
+        points: (n, 5, 3) corners and centre, m.
         side: (n,) narrow side, px.
+        distance: (n,) from the camera, m.
         cosine: (n,) of the incidence.
     """
     width, height, fold, least_cosine = limits[0], limits[1], limits[2], limits[3]
     max_range, min_side, border = limits[4], limits[5], limits[6]
     low = border - 0.5  # the picture's edge: pixels count from their centres
-    from_camera, p_W, p_WQ = np.empty(3), np.empty(3), np.empty((5, 3))
-    origin, tolerance, hidden = np.empty((1, 3)), np.empty(1), np.empty(5, np.bool_)
-    for i in range(3):
-        origin[0, i] = X_WC[i, 3]
+    from_camera, p_W = np.empty(3), np.empty(3)
     m = 0
     for n in range(len(sizes)):
         toward, square = 0.0, 0.0
@@ -218,17 +220,27 @@ def _find(
                 inside = False
                 break
             if q < 5:
-                p_WQ[q, 0], p_WQ[q, 1], p_WQ[q, 2] = p_W[0], p_W[1], p_W[2]
+                points[m, q, 0], points[m, q, 1], points[m, q, 2] = p_W[0], p_W[1], p_W[2]
             if q < 4:
                 pixels[m, q, 0], pixels[m, q, 1] = u, v
         if not inside:
             continue
         side[m] = narrow_side_of(pixels[m])
-        if not side[m] >= min_side:
-            continue
-        tolerance[0] = max(_BOARD, _BOARD_PART * far)
-        occlude(solids, origin, p_WQ, tolerance, hidden)
-        if not hidden.any():
-            index[m], cosine[m] = n, min(toward / far, 1.0)
+        if side[m] >= min_side:
+            index[m], distance[m], cosine[m] = n, far, min(toward / far, 1.0)
             m += 1
     return m
+
+
+@compiled(f"void({SOLID_ARRAYS}, f8[:,::1], f8[:,:,::1], f8[::1], b1[::1])")
+def _hide(
+    solids: SolidArrays, X_WC: Array, points: Array, distance: Array, hidden: NDArray[np.bool_]
+) -> None:
+    """Writes of which markers a solid hides a corner or the centre; arguments as of `_find`."""
+    origin, tolerance, some = np.empty((1, 3)), np.empty(1), np.empty(5, np.bool_)
+    for i in range(3):
+        origin[0, i] = X_WC[i, 3]
+    for n in range(len(points)):
+        tolerance[0] = max(_BOARD, _BOARD_PART * distance[n])
+        occlude(solids, origin, points[n], tolerance, some)
+        hidden[n] = some.any()
