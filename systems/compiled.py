@@ -15,6 +15,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core import sigutils
 from numpy.typing import NDArray
 
 Function = TypeVar("Function", bound=Callable[..., object])
@@ -56,7 +57,9 @@ def prepare() -> None:
     told = False
     while _WAITING:
         function, signature = _WAITING.pop()
-        function.compile(signature)
+        # Without the return type, as when compiled for a caller: it is part of the cache's key.
+        arguments, _ = sigutils.normalize_signature(signature)
+        function.compile(arguments)
         if function.stats.cache_misses and not told:
             told = True
             _log.info("compiling %d small loops, once on this machine", len(_WAITING) + 1)

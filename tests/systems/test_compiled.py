@@ -2,7 +2,11 @@ from __future__ import annotations
 
 import importlib
 import math
+import os
 import pkgutil
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -38,6 +42,24 @@ def test_what_is_prepared_is_compiled_for_its_signature_and_no_other() -> None:
     assert module._WAITING == []
     for function in waiting:
         assert len(function.signatures) == 1, function
+
+
+def test_a_second_start_compiles_nothing(tmp_path: Path) -> None:
+    # Some of these call others that are prepared too, which are then compiled for their callers.
+    start = """
+import systems.controllers.braking
+from systems import compiled
+functions = [function for function, _ in compiled._WAITING]
+compiled.prepare()
+print(sum(sum(function.stats.cache_misses.values()) for function in functions))
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    misses = [
+        int(subprocess.check_output([sys.executable, "-c", start], env=environment))
+        for _ in range(2)
+    ]
+    assert misses[0] > 1
+    assert misses[1] == 0
 
 
 def test_arrays_that_are_packed_already_are_not_copied() -> None:
