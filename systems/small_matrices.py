@@ -103,7 +103,7 @@ def congruence(A: Array, P: Array, product: Array) -> None:
             product[i, j] = product[j, i] = total
 
 
-@compiled()
+@compiled("void(f8[::1], f8[:,::1])")
 def rotation_of(w: Array, R: Array) -> None:
     """Writes exp([w]x) (Rodrigues) of a rotation vector w (3,) rad to R (3, 3)."""
     x, y, z = w[0], w[1], w[2]

@@ -22,6 +22,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.angles import wrap
+from systems.compiled import packed
+from systems.small_matrices import rotation_of
 
 Array = NDArray[np.float64]
 
@@ -31,7 +33,6 @@ SHELL_FRAME = "shell"  # the name that frame R has in messages and marker maps
 _R_0 = np.array([[0.0, 0.0, 1.0], [0.0, -1.0, 0.0], [1.0, 0.0, 0.0]])
 # Nearer to a pole than this (cosine of the pitch), rounding decides what yaw is.
 _AT_POLE = 1e-9
-_SMALL = 1e-8  # rad^2; below, the series' next terms round away
 
 
 def upright(pitch: Array | float, yaw: Array | float) -> Array:
@@ -149,26 +150,11 @@ def _one_rotation_vector(R: Array) -> Array:
 def one_rotation(w: Array) -> Array:
     """Returns exp([w]x) (3, 3) of a single rotation vector (3,) rad (Rodrigues).
 
-    In plain floats; `systems.markers.pnp.rotation_from_vector` is for many.
+    `systems.markers.pnp.rotation_from_vector` is for many.
     """
-    x, y, z = w.tolist()
-    square = x * x + y * y + z * z
-    if square > _SMALL:
-        angle = math.sqrt(square)
-        half = math.sin(angle / 2) / angle
-        a, b = math.sin(angle) / angle, 2 * half * half
-    else:
-        a, b = 1 - square / 6, 0.5 - square / 24
-    c = 1 - b * square
-    bxy, bxz, byz = b * x * y, b * x * z, b * y * z
-    ax, ay, az = a * x, a * y, a * z
-    return np.array(
-        [
-            [c + b * x * x, bxy - az, bxz + ay],
-            [bxy + az, c + b * y * y, byz - ax],
-            [bxz - ay, byz + ax, c + b * z * z],
-        ]
-    )
+    R = np.empty((3, 3))
+    rotation_of(packed(w), R)
+    return R
 
 
 def rotation_error(R_estimate: Array, R_true: Array) -> Array:
