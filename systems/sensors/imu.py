@@ -19,7 +19,6 @@ Array = NDArray[np.float64]
 
 GRAVITY = 9.81  # m/s^2, as Drake's UniformGravityFieldElement
 
-_NONE = np.zeros(0)
 _PIECE = 2**64  # of the noise stream: no sample has so high a number
 
 
@@ -245,87 +244,65 @@ def _ideal_sample(R: Array, V: Array, A: Array, p: Array, sample: Array) -> None
     sample[5] += ax * p[1] - ay * p[0] + wz * along - p[2] * square
 
 
+# Rows of what is the same at each sample, (5, 6).
+_WHITE, _LIMIT, _FORGET, _DRIFT_KICK, _SHAKE_KICK = range(5)
+# What a piece has, beside its matrix: places in one vector.
+_MATRIX, _BIAS, _DRIFT, _VIBRATION = slice(36), slice(36, 42), slice(42, 48), slice(48, 60)
+
+
 @compiled(
-    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], f8[::1], f8[::1], c16,"
-    " f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[::1], i8, f8[::1])"
+    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], c16, f8[::1], i8, f8[::1])"
 )
 def _take_sample(
     R: Array,
     V: Array,
     A: Array,
     p: Array,
-    vibration: Array,
-    matrix: Array,
-    bias: Array,
-    drift: Array,
+    piece: Array,
+    constants: Array,
     turn: complex,
-    shake_kick: Array,
-    forget: Array,
-    drift_kick: Array,
-    deviation: Array,
     noise: Array,
-    limit: Array,
     bits: int,
     sample: Array,
 ) -> None:
-    """Writes what the sensor tells (6,); see `_ideal_sample`, `_add_errors`, `_make_digital`."""
-    _ideal_sample(R, V, A, p, sample)
-    _add_errors(
-        sample, vibration, matrix, bias, drift, turn, shake_kick, forget, drift_kick, deviation,
-        noise,
-    )  # fmt: skip
-    _make_digital(sample, limit, bits)
-
-
-@compiled()
-def _add_errors(
-    sample: Array,
-    vibration: Array,
-    matrix: Array,
-    bias: Array,
-    drift: Array,
-    turn: complex,
-    shake_kick: Array,
-    forget: Array,
-    drift_kick: Array,
-    deviation: Array,
-    noise: Array,
-) -> None:
-    """Changes an ideal sample (6,) to one with errors, and vibration and drift to the next.
+    """Writes what the sensor tells, and carries its vibration and drift on to the next sample.
 
     Args:
-        sample: changed.
-        vibration: (12,) six complex numbers, changed; of size 0 without vibration.
-        matrix: (6, 6) scale and cross-axis errors.
-        bias: (6,).
-        drift: (6,), changed; of size 0 without drift.
+        R: (3, 3) as V (6,), A (6,) and p (3,) see `ideal_sample`.
+        V: (6,).
+        A: (6,).
+        p: (3,).
+        piece: (60,) scale and cross-axis errors (6, 6), bias (6,), drift (6,), and vibration as six
+            complex numbers (12,); the last two are changed.
+        constants: (5, 6) standard deviation of the white noise; range; what the drift is multiplied
+            with, deviation of what is added to it; deviation of what is added to the vibration.
         turn: what the vibration is multiplied with.
-        shake_kick: (6,) deviations of what is added to it.
-        forget: (6,) what the drift is multiplied with.
-        drift_kick: (6,) deviations of what is added to it.
-        deviation: (6,) of the white noise.
-        noise: (6, 12, 18 or 24) normal numbers: white, drift, vibration.
+        noise: (6, 12, 18 or 24) normal numbers: white, and those of the drift (6) and of the
+            vibration (12), where the sensor has them.
+        bits: see `ImuParameters`.
+        sample: (6,), written.
     """
-    if len(vibration):
+    _ideal_sample(R, V, A, p, sample)
+    matrix, bias = piece[_MATRIX].reshape(6, 6), piece[_BIAS]
+    drift, vibration = piece[_DRIFT], piece[_VIBRATION]
+    if len(noise) >= 18:
         first = len(noise) - 12
         for i in range(6):
             re, im = vibration[2 * i], vibration[2 * i + 1]
+            kick = constants[_SHAKE_KICK, i]
             sample[i] += re
-            vibration[2 * i] = (
-                turn.real * re - turn.imag * im + shake_kick[i] * noise[first + 2 * i]
-            )
-            vibration[2 * i + 1] = (
-                turn.real * im + turn.imag * re + shake_kick[i] * noise[first + 2 * i + 1]
-            )
+            vibration[2 * i] = turn.real * re - turn.imag * im + kick * noise[first + 2 * i]
+            vibration[2 * i + 1] = turn.real * im + turn.imag * re + kick * noise[first + 2 * i + 1]
     true = sample.copy()
     for i in range(6):
-        told = bias[i] + deviation[i] * noise[i]
+        told = bias[i] + constants[_WHITE, i] * noise[i]
         for j in range(6):
             told += matrix[i, j] * true[j]
-        if len(drift):
+        if len(noise) % 12 == 0:
             told += drift[i]
-            drift[i] = forget[i] * drift[i] + drift_kick[i] * noise[6 + i]
+            drift[i] = constants[_FORGET, i] * drift[i] + constants[_DRIFT_KICK, i] * noise[6 + i]
         sample[i] = told
+    _make_digital(sample, constants[_LIMIT], bits)
 
 
 class Imu(LeafSystem):
@@ -381,22 +358,23 @@ class Imu(LeafSystem):
         p = parameters or ImuParameters()
         self._parameters = p
         self._rate = rate
-        self._deviation = np.repeat([p.gyro_noise_density, p.accel_noise_density], 3)
-        self._deviation *= np.sqrt(rate)
         self._drift_deviation = np.repeat([p.gyro_drift, p.accel_drift], 3)
-        self._forget = np.exp(-1.0 / (rate * np.repeat([p.gyro_drift_time, p.accel_drift_time], 3)))
-        self._kick = self._drift_deviation * np.sqrt(1.0 - self._forget**2)
-        shake = np.array([*p.gyro_vibration, *p.accel_vibration])
+        self._shake = np.array([*p.gyro_vibration, *p.accel_vibration])
+        forget = np.exp(-1.0 / (rate * np.repeat([p.gyro_drift_time, p.accel_drift_time], 3)))
         decay = math.exp(-math.pi * p.vibration_bandwidth / rate)
         self._turn = decay * np.exp(2j * math.pi * p.vibration_frequency / rate)
-        self._shake = shake
-        self._shake_kick = shake * math.sqrt(1.0 - decay**2)
-        self._limit = np.repeat(
+        constants = np.empty((5, 6))
+        constants[_WHITE] = np.repeat([p.gyro_noise_density, p.accel_noise_density], 3)
+        constants[_WHITE] *= np.sqrt(rate)
+        constants[_LIMIT] = np.repeat(
             [np.inf if limit is None else limit for limit in (p.gyro_range, p.accel_range)], 3
         )
+        constants[_FORGET] = forget
+        constants[_DRIFT_KICK] = self._drift_deviation * np.sqrt(1.0 - forget**2)
+        constants[_SHAKE_KICK] = self._shake * math.sqrt(1.0 - decay**2)
+        self._constants = constants
         # What a sensor does not have costs nothing at each of its samples.
-        self._drifts = bool(self._drift_deviation.any())
-        self._vibrates = bool(shake.any())
+        self._noises = 6 + 6 * bool(self._drift_deviation.any()) + 12 * bool(self._shake.any())
         self._p_BS = np.zeros(3) if p_BS is None else np.array(p_BS, float)
         sound = self._p_BS.shape == (3,) and bool(np.isfinite(self._p_BS).all())
         require(sound, "p_BS", self._p_BS.tolist(), "three finite numbers (m)")
@@ -407,10 +385,8 @@ class Imu(LeafSystem):
         self._velocity_input = self.DeclareVectorInputPort("spatial_velocity", 6)
         self._acceleration_input = self.DeclareVectorInputPort("spatial_acceleration", 6)
         self._sample = self.DeclareDiscreteState(6)
-        self._matrix = self.DeclareDiscreteState(np.eye(6).ravel())
-        self._bias = self.DeclareDiscreteState(np.array([*p.gyro_bias, *p.accel_bias]))
-        self._drift = self.DeclareDiscreteState(6)
-        self._vibration = self.DeclareDiscreteState(12)  # six complex numbers
+        bias = [*p.gyro_bias, *p.accel_bias]
+        self._piece = self.DeclareDiscreteState(np.r_[np.eye(6).ravel(), bias, np.zeros(18)])
         self.DeclareInitializationDiscreteUpdateEvent(self._switch_on)
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._measure)
         self._sample_output = self.DeclareStateOutputPort("sample", self._sample)
@@ -434,34 +410,22 @@ class Imu(LeafSystem):
     def _switch_on(self, context: Context, discrete_state: DiscreteValues) -> None:
         random = self._noise.generator(context, _PIECE)
         matrix, bias = piece_errors(self._parameters, random)
-        discrete_state.set_value(self._matrix, matrix.ravel())
-        discrete_state.set_value(self._bias, bias)
         drift = self._drift_deviation * random.standard_normal(6)
-        discrete_state.set_value(self._drift, drift)
         vibration = np.repeat(self._shake, 2) * random.standard_normal(12)
-        discrete_state.set_value(self._vibration, vibration)
+        piece = np.concatenate([matrix.ravel(), bias, drift, vibration])
+        discrete_state.set_value(self._piece, piece)
 
     def _measure(self, context: Context, discrete_state: DiscreteValues) -> None:
-        size = 6 + 6 * self._drifts + 12 * self._vibrates
-        noise = self._noise.normals(context, sample_index(context.get_time(), self._rate), size)
-        vibration = discrete_state.get_mutable_value(self._vibration)
-        drift = discrete_state.get_mutable_value(self._drift)
+        index = sample_index(context.get_time(), self._rate)
         _take_sample(
             packed(self._pose_input.Eval(context).rotation().matrix()),
             packed(self._velocity_input.Eval(context)),
             packed(self._acceleration_input.Eval(context)),
             self._p_BS,
-            vibration if self._vibrates else _NONE,
-            discrete_state.get_mutable_value(self._matrix).reshape(6, 6),
-            discrete_state.get_mutable_value(self._bias),
-            drift if self._drifts else _NONE,
+            discrete_state.get_mutable_value(self._piece),
+            self._constants,
             self._turn,
-            self._shake_kick,
-            self._forget,
-            self._kick,
-            self._deviation,
-            packed(noise),
-            self._limit,
+            packed(self._noise.normals(context, index, self._noises)),
             self._parameters.bits,
             discrete_state.get_mutable_value(self._sample),
         )
