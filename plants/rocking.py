@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.geometry import FrameId, FramePoseVector, GeometryFrame, SceneGraph
 from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.multibody.plant import MultibodyPlant
+from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.framework import (
     Context,
     DiagramBuilder,
@@ -26,13 +28,13 @@ from pydrake.systems.framework import (
 
 from systems.compiled import compiled, packed
 from systems.noise import NoiseStream
+from systems.small_matrices import multiply, rotation_of_quaternion
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
 
 _SINES = 12  # for each axis
 _FADE = 0.5  # s
-_NONE = np.zeros(0)
 _SMALL = 1e-2  # rad^2; below, series are more exact than what they are the series of
 
 
@@ -167,37 +169,50 @@ def _tilted(q: Array, R: Array, turning: Array) -> None:
     turning[1, 2] = b_s * ds * k + b * dk
 
 
-@compiled("void(f8[:,::1], c16[:,:,::1], f8, f8[:,::1], f8[:,::1])")
-def _rock(
-    rates: Array, weights: NDArray[np.complex128], t: float, R: Array, turning: Array
+# Of the body in W: rotation, row by row; place; velocity; what it adds to B0's acceleration.
+_ROTATION, _PLACE, _VELOCITY, _ADDED = slice(9), slice(9, 12), slice(12, 18), slice(18, 21)
+
+
+@compiled("void(f8[:,::1], c16[:,:,::1], f8, f8[::1], i8, f8[::1])")
+def _ride(
+    rates: Array,
+    weights: NDArray[np.complex128],
+    t: float,
+    state: Array,
+    num_positions: int,
+    motion: Array,
 ) -> None:
-    """Writes how the body is turned in the chassis, and turns, at t (s); see `_tilted`."""
-    q = np.empty((3, 2))
-    _tilt(rates, weights, t, q)
-    _tilted(q, R, turning)
-
-
-@compiled("void(f8[:,::1], f8[:,::1], f8[::1], f8[::1], f8[::1])")
-def _carry(R: Array, turning: Array, V: Array, velocity: Array, acceleration: Array) -> None:
-    """Adds to what a chassis does what the body on it does beside.
+    """Writes the motion (21,) in W of a body that rocks over a chassis.
 
     Args:
-        R: (3, 3) of the chassis in W.
-        turning: (2, 3) of the body, told in the chassis; see `_tilted`.
-        V: (6,) velocity of the chassis in W; only asked for by an acceleration.
-        velocity: (6,), changed; of size 0 for none.
-        acceleration: (6,), changed; of size 0 for none.
+        rates: see `Waves`, as `weights`.
+        weights: likewise.
+        t: s.
+        state: of the chassis: positions, of which its quaternion and place are the first seven,
+            then velocities, of which its own are the first six.
+        num_positions: in `state`.
+        motion: written: `R_WB` (9), `p_WB` (3), `V_WB` (6, rotation first), and by what its angular
+            acceleration exceeds that of the chassis (3).
     """
-    w = np.empty(3)
+    q, R_B0B, turning = np.empty((3, 2)), np.empty((3, 3)), np.empty((2, 3))
+    _tilt(rates, weights, t, q)
+    _tilted(q, R_B0B, turning)
+    R_WB0 = np.empty((3, 3))
+    rotation_of_quaternion(state[:4], R_WB0)
+    multiply(R_WB0, R_B0B, motion[_ROTATION].reshape(3, 3))
+    motion[_PLACE] = state[4:7]
+    motion[_VELOCITY] = state[num_positions : num_positions + 6]
+    w0, w = motion[_VELOCITY][:3].copy(), np.empty(3)
     for i in range(3):
-        w[i] = R[i, 0] * turning[0, 0] + R[i, 1] * turning[0, 1] + R[i, 2] * turning[0, 2]
-    for i in range(len(velocity) // 2):
-        velocity[i] += w[i]
-    for i in range(len(acceleration) // 2):
+        w[i] = (
+            R_WB0[i, 0] * turning[0, 0] + R_WB0[i, 1] * turning[0, 1] + R_WB0[i, 2] * turning[0, 2]
+        )
+        motion[_VELOCITY][i] += w[i]
+    for i in range(3):
         a, b = (i + 1) % 3, (i + 2) % 3
+        motion[_ADDED][i] = w0[a] * w[b] - w0[b] * w[a]  # it turns with the chassis: Coriolis
         for j in range(3):
-            acceleration[i] += R[i, j] * turning[1, j]
-        acceleration[i] += V[a] * w[b] - V[b] * w[a]  # what turns with the chassis: Coriolis
+            motion[_ADDED][i] += R_WB0[i, j] * turning[1, j]
 
 
 class RockingBody(LeafSystem):
@@ -207,9 +222,8 @@ class RockingBody(LeafSystem):
 
         name: RockingBody
         input_ports:
-        - pose
-        - spatial_velocity
-        - spatial_acceleration
+        - state
+        - generalized_acceleration
         output_ports:
         - pose
         - spatial_velocity
@@ -217,6 +231,9 @@ class RockingBody(LeafSystem):
         - frame_pose
 
     Args:
+        num_positions: of the chassis' model instance; the floating body's quaternion and place come
+            first.
+        num_velocities: likewise; the floating body's come first.
         parameters: how far and how fast.
         frame_id: of a geometry frame that rocks with the body, its parent the world's; None for
             none.
@@ -224,72 +241,71 @@ class RockingBody(LeafSystem):
         name: of the noise stream.
 
     Ports:
-        pose (input, RigidTransform): `X_WB0` of the chassis.
-        spatial_velocity (input, vector of 6): of B0 in W, rotation first (rad/s, m/s).
-        spatial_acceleration (input, vector of 6): likewise (rad/s^2, m/s^2).
+        state (input, vector of positions and velocities): the plant's `{model}_state`.
+        generalized_acceleration (input, vector of velocities): the plant's
+            `{model}_generalized_acceleration`.
         pose (output, RigidTransform): `X_WB`; its origin is B0's.
         spatial_velocity (output, vector of 6): of B in W, rotation first (rad/s, m/s).
         spatial_acceleration (output, vector of 6): likewise (rad/s^2, m/s^2).
         frame_pose (output, FramePoseVector): `X_WB` for SceneGraph; empty without a frame.
 
-    The motion is a sum of sines drawn from the seed and depends on nothing but the time: nothing
-    that happens to the chassis shakes the body, and the body's inertia does not act back. It fades
-    in during the first half second.
+    It stands where a `BodyState` does for a body without springs. The motion is a sum of sines
+    drawn from the seed and depends on nothing but the time: nothing that happens to the chassis
+    shakes the body, and the body's inertia does not act back. It fades in during the first half
+    second.
 
     Raises:
-        ValueError: seed out of range.
+        ValueError: num_positions or seed out of range.
     """
 
     def __init__(
         self,
         *,
+        num_positions: int = 7,
+        num_velocities: int = 6,
         parameters: RockingParameters | None = None,
         frame_id: FrameId | None = None,
         seed: int = 0,
         name: str = "rocking",
     ) -> None:
         super().__init__()
+        require(num_positions >= 7, "num_positions", num_positions, "at least 7")
+        self._num_positions = num_positions
         self._parameters = parameters or RockingParameters()
         self._frame_id = frame_id
         self._noise = NoiseStream(self, seed=seed, name=name)
-        self._pose_input = self.DeclareAbstractInputPort(
-            "pose", AbstractValue.Make(RigidTransform())
+        self._state_input = self.DeclareVectorInputPort("state", num_positions + num_velocities)
+        self._acceleration_input = self.DeclareVectorInputPort(
+            "generalized_acceleration", num_velocities
         )
-        self._velocity_input = self.DeclareVectorInputPort("spatial_velocity", 6)
-        self._acceleration_input = self.DeclareVectorInputPort("spatial_acceleration", 6)
         self._waves = self.DeclareCacheEntry(
             "sines of this seed",
             ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=self._calc_waves),
             {self.all_parameters_ticket()},
         )
         self._motion = self.DeclareCacheEntry(
-            "the body in the chassis",
+            "the body in the world",
             ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=self._calc_motion),
-            {self.time_ticket(), self._waves.ticket()},
+            {self.time_ticket(), self._waves.ticket(), self._state_input.ticket()},
         )
-        tickets = [
-            self._motion.ticket(),
-            self._pose_input.ticket(),
-            self._velocity_input.ticket(),
-            self._acceleration_input.ticket(),
-        ]
+        motion = {self._motion.ticket()}
         self._pose_output = self.DeclareAbstractOutputPort(
-            "pose",
-            lambda: AbstractValue.Make(RigidTransform()),
-            self._calc_pose,
-            set(tickets[:2]),
+            "pose", lambda: AbstractValue.Make(RigidTransform()), self._calc_pose, motion
         )
         self._velocity_output = self.DeclareVectorOutputPort(
-            "spatial_velocity", 6, self._calc_velocity, set(tickets[:3])
+            "spatial_velocity", 6, self._calc_velocity, motion
         )
         self._acceleration_output = self.DeclareVectorOutputPort(
-            "spatial_acceleration", 6, self._calc_acceleration, set(tickets)
+            "spatial_acceleration",
+            6,
+            self._calc_acceleration,
+            motion | {self._acceleration_input.ticket()},
         )
         self._frame_pose_output = self.DeclareAbstractOutputPort(
             "frame_pose",
             lambda: AbstractValue.Make(FramePoseVector()),
             self._calc_frame_pose,
-            set(tickets[:2]),
+            motion,
         )
 
     @property
@@ -297,16 +313,12 @@ class RockingBody(LeafSystem):
         """The geometry frame that rocks with the body."""
         return self._frame_id
 
-    def pose_input_port(self) -> InputPort:
-        """Returns the port of the chassis' pose."""
-        return self._pose_input
+    def state_input_port(self) -> InputPort:
+        """Returns the port of positions and velocities."""
+        return self._state_input
 
-    def spatial_velocity_input_port(self) -> InputPort:
-        """Returns the port of the chassis' velocity."""
-        return self._velocity_input
-
-    def spatial_acceleration_input_port(self) -> InputPort:
-        """Returns the port of the chassis' acceleration."""
+    def generalized_acceleration_input_port(self) -> InputPort:
+        """Returns the port of the accelerations."""
         return self._acceleration_input
 
     def pose_output_port(self) -> OutputPort:
@@ -330,55 +342,64 @@ class RockingBody(LeafSystem):
 
     def _calc_motion(self, context: Context, output: AbstractValue) -> None:
         (waves,) = self._waves.Eval(context)
-        R_B0B, turning = np.empty((3, 3)), np.empty((2, 3))
-        _rock(waves.rates, waves.weights, context.get_time(), R_B0B, turning)
-        output.set_value([R_B0B, turning])
+        state = packed(self._state_input.Eval(context))
+        motion = np.empty(21)
+        _ride(waves.rates, waves.weights, context.get_time(), state, self._num_positions, motion)
+        output.set_value([motion])
 
     def _calc_pose(self, context: Context, output: AbstractValue) -> None:
-        X_WB0: RigidTransform = self._pose_input.Eval(context)
-        R_B0B, _ = self._motion.Eval(context)
-        output.set_value(X_WB0.multiply(RigidTransform(RotationMatrix(R_B0B))))
+        (motion,) = self._motion.Eval(context)
+        R_WB = RotationMatrix(motion[_ROTATION].reshape(3, 3))
+        output.set_value(RigidTransform(R_WB, motion[_PLACE]))
 
     def _calc_velocity(self, context: Context, output: Any) -> None:
-        velocity = self._velocity_input.Eval(context).copy()
-        _carry(*self._turning(context), _NONE, velocity, _NONE)
-        output.SetFromVector(velocity)
+        (motion,) = self._motion.Eval(context)
+        output.SetFromVector(motion[_VELOCITY])
 
     def _calc_acceleration(self, context: Context, output: Any) -> None:
-        V = packed(self._velocity_input.Eval(context))
-        acceleration = self._acceleration_input.Eval(context).copy()
-        _carry(*self._turning(context), V, _NONE, acceleration)
+        (motion,) = self._motion.Eval(context)
+        acceleration = self._acceleration_input.Eval(context)[:6].copy()
+        acceleration[:3] += motion[_ADDED]
         output.SetFromVector(acceleration)
 
-    def _turning(self, context: Context) -> tuple[Array, Array]:
-        """Returns how the chassis is turned, and how the body on it turns."""
-        _, turning = self._motion.Eval(context)
-        return packed(self._pose_input.Eval(context).rotation().matrix()), turning
-
-    def _calc_frame_pose(self, context: Context, output: AbstractValue) -> None:
-        poses = FramePoseVector()
+    def _calc_frame_pose(self, context: Context, output: Any) -> None:
         if self._frame_id is not None:
-            poses.set_value(self._frame_id, self._pose_output.Eval(context))
-        output.set_value(poses)
+            X_WB = self._pose_output.Eval(context)
+            output.get_mutable_value().set_value(self._frame_id, X_WB)
 
     @staticmethod
     def AddToBuilder(
         builder: DiagramBuilder,
+        plant: MultibodyPlant,
+        model: ModelInstanceIndex,
         scene_graph: SceneGraph,
         *,
         parameters: RockingParameters | None = None,
         seed: int = 0,
         name: str = "rocking",
     ) -> RockingBody:
-        """Adds the block with a geometry frame of its name, connected to the scene.
+        """Adds the block over a model whose base floats, with a geometry frame of its name.
 
-        A camera on the body has this frame (`frame_id`) as its parent.
+        It is connected to plant and scene. A camera on the body has this frame (`frame_id`) as its
+        parent.
         """
         source = scene_graph.RegisterSource(name)
         frame = scene_graph.RegisterFrame(source, GeometryFrame(name))
         block = builder.AddSystem(
-            RockingBody(parameters=parameters, frame_id=frame, seed=seed, name=name)
+            RockingBody(
+                num_positions=plant.num_positions(model),
+                num_velocities=plant.num_velocities(model),
+                parameters=parameters,
+                frame_id=frame,
+                seed=seed,
+                name=name,
+            )
         )
         block.set_name(name)
+        builder.Connect(plant.get_state_output_port(model), block.state_input_port())
+        builder.Connect(
+            plant.get_generalized_acceleration_output_port(model),
+            block.generalized_acceleration_input_port(),
+        )
         builder.Connect(block.frame_pose_output_port(), scene_graph.get_source_pose_port(source))
         return block

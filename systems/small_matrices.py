@@ -121,6 +121,16 @@ def rotation_of(w: Array, R: Array) -> None:
 
 
 @compiled()
+def rotation_of_quaternion(q: Array, R: Array) -> None:
+    """Writes the rotation (3, 3) of a quaternion w, x, y, z of any length but 0."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    s = 2 / (w * w + x * x + y * y + z * z)
+    R[0, 0], R[0, 1], R[0, 2] = 1 - s * (y * y + z * z), s * (x * y - w * z), s * (x * z + w * y)
+    R[1, 0], R[1, 1], R[1, 2] = s * (x * y + w * z), 1 - s * (x * x + z * z), s * (y * z - w * x)
+    R[2, 0], R[2, 1], R[2, 2] = s * (x * z - w * y), s * (y * z + w * x), 1 - s * (x * x + y * y)
+
+
+@compiled()
 def eigen(A: Array, values: Array, vectors: Array) -> None:
     """Writes the eigenvalues (n,), in no order, and eigenvectors of a symmetric A (n, n).
 

@@ -697,9 +697,8 @@ CASES: dict[type, Callable[[Path], Case]] = {
     RockingBody: lambda _: Case(
         RockingBody(parameters=RockingParameters(bound=0.1), frame_id=WORLD),
         {
-            "pose": POSES,
-            "spatial_velocity": vector(0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
-            "spatial_acceleration": vector(0.6, 0.5, 0.4, 0.3, 0.2, 0.1),
+            "state": vector(0.8, 0.1, -0.2, 0.3, 1.0, 2.0, 3.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6),
+            "generalized_acceleration": vector(0.6, 0.5, 0.4, 0.3, 0.2, 0.1),
         },
     ),
     RenderedCamera: lambda _: Case(

@@ -115,20 +115,20 @@ class SnailBotBody:
         plant = station.plant
         base = plant.GetBodyByName("base_link", robot.model)
         robot.frame_id = plant.GetBodyFrameIdOrThrow(base.index())
-        state = BodyState.AddToBuilder(station.builder, plant, robot.model)
-        state.set_name(f"{robot.name}.state")
-        robot.state = state
         if self.rocking.bound > 0:
             robot.state = RockingBody.AddToBuilder(
                 station.builder,
+                plant,
+                robot.model,
                 station.scene_graph,
                 parameters=self.rocking,
                 seed=station.seed,
                 name=f"{robot.name}.rocking",
             )
             robot.frame_id = robot.state.frame_id
-            for port in ("pose", "spatial_velocity", "spatial_acceleration"):
-                station.connect(state.GetOutputPort(port), robot.state.GetInputPort(port))
+        else:
+            robot.state = BodyState.AddToBuilder(station.builder, plant, robot.model)
+            robot.state.set_name(f"{robot.name}.state")
         servos = station.add(
             MatrixGain(servo_matrix(plant, robot.model, self.parameters, self.shell)),
             f"{robot.name}.servos",

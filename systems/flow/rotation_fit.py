@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from systems.compiled import compiled, packed
 from systems.plumb_bob import distort
-from systems.small_matrices import eigen, multiply, turn
+from systems.small_matrices import eigen, multiply, rotation_of_quaternion, turn
 
 Array = NDArray[np.float64]
 
@@ -50,10 +50,7 @@ def _by_quaternion(B: Array, R: Array) -> None:
     for k in range(1, 4):
         if values[k] > values[best]:
             best = k
-    w, x, y, z = vectors[0, best], vectors[1, best], vectors[2, best], vectors[3, best]
-    R[0, 0], R[0, 1], R[0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    R[1, 0], R[1, 1], R[1, 2] = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    R[2, 0], R[2, 1], R[2, 2] = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    rotation_of_quaternion(vectors[:, best], R)
 
 
 @compiled("i8(f8[:,::1], f8[:,::1], f8[:,::1], f8, b1[::1])")

@@ -4,12 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from pydrake.common.value import AbstractValue
-from pydrake.geometry import FramePoseVector, SceneGraph
 from pydrake.math import RigidTransform, RollPitchYaw, RotationMatrix
+from pydrake.multibody.plant import AddMultibodyPlantSceneGraph
+from pydrake.multibody.tree import RevoluteJoint, SpatialInertia
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
-from pydrake.systems.primitives import ConstantValueSource, ConstantVectorSource
 from scipy.spatial.transform import Rotation
 
 from plants.rocking import RockingBody, RockingParameters, Waves, draw_waves, tilt, tilted
@@ -125,15 +124,19 @@ class Chassis:
         return X, np.concatenate([w, b + 2 * c * t]), np.concatenate([alpha, 2 * c])
 
 
+def state_of(X: RigidTransform, V: np.ndarray) -> np.ndarray:
+    """What the plant tells of a body that floats; its quaternion is not quite of length 1."""
+    return np.concatenate([1.001 * X.rotation().ToQuaternion().wxyz(), X.translation(), V])
+
+
 def set_chassis(
     block: RockingBody, context: Context, t: float, chassis: Chassis
 ) -> tuple[RigidTransform, np.ndarray, np.ndarray]:
     """What the body does at t."""
     X, V, A = chassis(t)
     context.SetTime(t)
-    block.pose_input_port().FixValue(context, X)
-    block.spatial_velocity_input_port().FixValue(context, V)
-    block.spatial_acceleration_input_port().FixValue(context, A)
+    block.state_input_port().FixValue(context, state_of(X, V))
+    block.generalized_acceleration_input_port().FixValue(context, A)
     return (
         RigidTransform(block.pose_output_port().Eval(context)),
         block.spatial_velocity_output_port().Eval(context).copy(),
@@ -213,31 +216,46 @@ def test_without_a_bound_it_is_the_chassis() -> None:
     assert block.frame_pose_output_port().Eval(context).size() == 0
 
 
-def test_a_frame_of_the_scene_rocks_with_it() -> None:
+def test_over_a_plants_body_it_rocks_in_the_scene() -> None:
+    """Thrown and turning, with a joint of its own: against the plant's own pose and motion."""
     builder = DiagramBuilder()
-    scene_graph = builder.AddSystem(SceneGraph())
-    block = RockingBody.AddToBuilder(builder, scene_graph, parameters=STRONG, name="body")
-    X, V, A = Chassis(0)(0.0)
-    pose = builder.AddSystem(ConstantValueSource(AbstractValue.Make(X)))
-    builder.Connect(pose.get_output_port(), block.pose_input_port())
-    for value, port in (
-        (V, block.spatial_velocity_input_port()),
-        (A, block.spatial_acceleration_input_port()),
-    ):
-        source = builder.AddSystem(ConstantVectorSource(value))
-        builder.Connect(source.get_output_port(), port)
+    plant, scene_graph = AddMultibodyPlantSceneGraph(builder, time_step=1e-3)
+    model = plant.AddModelInstance("robot")
+    inertia = SpatialInertia.SolidBoxWithMass(1.0, 0.1, 0.2, 0.3)
+    base, arm = (plant.AddRigidBody(name, model, inertia) for name in ("base_link", "arm"))
+    axis = [0.0, 0.0, 1.0]
+    plant.AddJoint(RevoluteJoint("joint", base.body_frame(), arm.body_frame(), axis))
+    plant.Finalize()
+    block = RockingBody.AddToBuilder(
+        builder, plant, model, scene_graph, parameters=STRONG, name="body"
+    )
     diagram = builder.Build()
     simulator = Simulator(diagram)
+    context = simulator.get_mutable_context()
+    own = plant.GetMyMutableContextFromRoot(context)
+    velocities = [0.4, -0.8, 1.1, 0.2, 0.3, -0.1, 2.0]
+    plant.SetVelocities(own, model, np.array(velocities))
     simulator.AdvanceTo(1.3)
-    context = simulator.get_context()
+    rocking = block.GetMyContextFromRoot(context)
+    told = block.pose_output_port().Eval(rocking)
+    X_WB0 = base.EvalPoseInWorld(own)
+    V_WB0 = base.EvalSpatialVelocityInWorld(own).get_coeffs()
+    A_WB0 = base.EvalSpatialAccelerationInWorld(own).get_coeffs()
+    reference = RockingBody(parameters=STRONG, name="body")
+    alone = reference.CreateDefaultContext()
+    alone.SetTime(1.3)
+    reference.state_input_port().FixValue(alone, state_of(X_WB0, V_WB0))
+    reference.generalized_acceleration_input_port().FixValue(alone, A_WB0)
+    assert told.IsNearlyEqualTo(reference.pose_output_port().Eval(alone), 1e-12)
+    assert not told.IsNearlyEqualTo(X_WB0, 0.01)
+    # The plant tells the acceleration of its next step, of which a millisecond is known.
+    for port, rtol in (("spatial_velocity", 1e-12), ("spatial_acceleration", 1e-3)):
+        values = (b.GetOutputPort(port).Eval(c) for b, c in ((block, rocking), (reference, alone)))
+        np.testing.assert_allclose(*values, rtol=rtol, atol=1e-9)
     query = scene_graph.get_query_output_port().Eval(scene_graph.GetMyContextFromRoot(context))
-    own = block.GetMyContextFromRoot(context)
-    told = block.pose_output_port().Eval(own)
     assert block.frame_id is not None
     assert query.GetPoseInWorld(block.frame_id).IsNearlyEqualTo(told, 1e-12)
-    assert not told.IsNearlyEqualTo(X, 0.01)
     assert query.inspector().GetName(block.frame_id) == "body"
-    assert isinstance(block.frame_pose_output_port().Eval(own), FramePoseVector)
 
 
 @pytest.mark.parametrize(
@@ -254,6 +272,8 @@ def test_bad_parameters_are_refused(arguments: dict[str, float], message: str) -
         RockingParameters(**arguments)
 
 
-def test_a_bad_seed_is_refused() -> None:
+def test_a_bad_seed_and_a_body_that_does_not_float_are_refused() -> None:
     with pytest.raises(ValueError, match="seed is -1"):
         RockingBody(seed=-1)
+    with pytest.raises(ValueError, match="num_positions is 3: must be at least 7"):
+        RockingBody(num_positions=3)
