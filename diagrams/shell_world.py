@@ -12,11 +12,10 @@ from pydrake.common.value import AbstractValue
 from pydrake.geometry import FrameId
 from pydrake.math import RigidTransform
 from pydrake.multibody.tree import ModelInstanceIndex
-from pydrake.systems.primitives import ConstantValueSource
+from pydrake.systems.primitives import Adder, ConstantValueSource
 
 from diagrams.schema import File, ScenarioError, file_path
 from diagrams.world import World
-from plants.magnets import JoinForces
 from plants.relative_pose import FramePose
 from plants.shell import (
     BODY,
@@ -180,11 +179,11 @@ class ShellWorldParameters(World):
             )
 
     def _add_magnets(self, station: StationBuilder) -> None:
-        forces = station.plant.get_applied_spatial_force_input_port()
+        forces = station.plant.get_applied_generalized_force_input_port()
         if len(station.pulls) == 1:
             station.connect(station.pulls[0], forces)
             return
-        joined = station.add(JoinForces(robots=len(station.pulls)), "magnets")
-        for k, pull in enumerate(station.pulls, start=1):
-            station.connect(pull, joined.GetInputPort(f"forces_{k}"))
-        station.connect(joined.forces_output_port(), forces)
+        total = station.add(Adder(len(station.pulls), station.plant.num_velocities()), "magnets")
+        for k, pull in enumerate(station.pulls):
+            station.connect(pull, total.get_input_port(k))
+        station.connect(total.get_output_port(), forces)

@@ -224,7 +224,7 @@ class StationBuilder:
         outputs: exported so far, by name.
         carried_markers: on robots, by the robot's name.
         shells: that robots stand on, by the name of who has it.
-        pulls: what the magnets of each robot on a shell do: lists of forces for the plant.
+        pulls: what the magnets of each robot on a shell do: generalized forces for the plant.
         robots: by name.
     """
 

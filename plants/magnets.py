@@ -9,27 +9,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.value import AbstractValue
-from pydrake.math import RigidTransform
-from pydrake.multibody.math import SpatialForce
-from pydrake.multibody.plant import ExternallyAppliedSpatialForce, MultibodyPlant
+from pydrake.multibody.plant import MultibodyPlant
 from pydrake.multibody.tree import BodyIndex, ModelInstanceIndex
-from pydrake.systems.framework import (
-    Context,
-    DiagramBuilder,
-    InputPort,
-    LeafSystem,
-    OutputPort,
-    ValueProducer,
-)
+from pydrake.systems.framework import Context, DiagramBuilder, InputPort, LeafSystem, OutputPort
 
 from plants.adhesion_margin import Suspension, adhesion_margin
+from plants.mechanism import Mechanism, add_force, place_links
 from plants.shell import ShellParameters
-from systems.compiled import compiled
+from systems.compiled import compiled, packed
 from systems.markers.pnp import cross_matrix
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
 
 
 @dataclass
@@ -62,29 +54,45 @@ def magnet_force(gap: Any, parameters: MagnetParameters) -> Any:
     return parameters.force / (1 + np.maximum(gap, 0.0) / parameters.gap) ** 2
 
 
-@compiled("void(f8[:,::1], f8, f8, f8, f8[:,::1])")
-def _pull(centres: Array, reach: float, force: float, gap: float, F: Array) -> None:
-    """Writes the spatial forces, see `magnet_force`.
+@compiled("void(i8[:,::1], f8[:,::1], i8[::1], f8[::1], f8, f8, f8, f8[::1])")
+def _pull(
+    links: Indices,
+    shapes: Array,
+    places: Indices,
+    state: Array,
+    reach: float,
+    force: float,
+    gap: float,
+    tau: Array,
+) -> None:
+    """Writes what the magnets do to the plant's joints, see `magnet_force`.
 
     Args:
-        centres: (n + 1, 3) of the wheels, and of the shell, m.
+        links: see `Mechanism`, as `shapes`.
+        shapes: likewise.
+        places: (n + 1,) in `links`, of the wheels and of the shell.
+        state: of the plant.
         reach: distance of a wheel's centre from the shell's when they touch, m.
         force: at contact, N.
         gap: at which a quarter of it is left, m.
-        F: (n + 1, 6) zeros; the forces are written, and last their reaction on the shell, N.
+        tau: (velocities of the plant,) zeros; the generalized forces are written.
     """
-    last = len(centres) - 1
-    offset = np.empty(3)
-    for k in range(last):
+    n, shell = len(links), places[-1]
+    R, p, pivots, axes = np.empty((n, 3, 3)), np.empty((n, 3)), np.empty((n, 3)), np.empty((n, 3))
+    place_links(links, shapes, state, R, p, pivots, axes)
+    F, reaction = np.empty(3), np.zeros(3)
+    for wheel in places[:-1]:
         square = 0.0
         for i in range(3):
-            offset[i] = centres[k, i] - centres[last, i]
-            square += offset[i] * offset[i]
+            F[i] = p[shell, i] - p[wheel, i]
+            square += F[i] * F[i]
         distance = math.sqrt(square)
         weaker = 1 + max(distance - reach, 0.0) / gap
         for i in range(3):
-            F[k, 3 + i] = -force / (weaker * weaker) / distance * offset[i]
-            F[last, 3 + i] -= F[k, 3 + i]
+            F[i] *= force / (weaker * weaker) / distance
+            reaction[i] -= F[i]
+        add_force(links, p, pivots, axes, wheel, F, tau)
+    add_force(links, p, pivots, axes, shell, reaction, tau)
 
 
 class MagneticAdhesion(LeafSystem):
@@ -94,9 +102,9 @@ class MagneticAdhesion(LeafSystem):
 
         name: MagneticAdhesion
         input_ports:
-        - body_poses
+        - state
         output_ports:
-        - forces
+        - generalized_forces
         - gaps
         - margin
         - detached
@@ -115,10 +123,10 @@ class MagneticAdhesion(LeafSystem):
             drives on it.
 
     Ports:
-        body_poses (input, list): the plant's `body_poses`.
-        forces (output, list): `ExternallyAppliedSpatialForce` of each wheel, toward the sphere's
-            centre, and last their reaction on the sphere: for the plant's
-            `applied_spatial_force` (of several robots: joined).
+        state (input, vector of positions and velocities): of the plant, all of it.
+        generalized_forces (output, vector of its velocities): what the pull of each wheel toward
+            the sphere's centre, and their reaction on the sphere, do to the joints; for the plant's
+            `applied_generalized_force` (of several robots: their sum).
         gaps (output, vector of one for each wheel): between wheel and shell, in the order of the
             bodies, m; negative when they are pressed together.
         margin (output, vector of 1): see `adhesion_margin`; of the robot with its arms and wheels
@@ -144,73 +152,58 @@ class MagneticAdhesion(LeafSystem):
         super().__init__()
         require_positive(wheel_radius=wheel_radius)
         self._parameters = parameters or MagnetParameters()
-        self._wheel_radius = wheel_radius
         self._shell_radius = shell_parameters.radius
+        self._reach = shell_parameters.radius + wheel_radius
         self._friction = shell_parameters.friction
         bodies = [plant.get_body(index) for index in plant.GetBodyIndices(model)]
         wheels = [body.index() for body in bodies if body.name().endswith("_wheel")]
         require(len(wheels) >= 3, "wheels", len(wheels), "at least three bodies named ..._wheel")
-        self._wheels = [int(index) for index in wheels]
-        self._shell = int(plant.GetBodyByName("shell", shell).index())
-        self._bodies = [*wheels, BodyIndex(self._shell)]
-        self._pulled = [*self._wheels, self._shell]
         self._supports = _supports(plant, wheels)
         # Which wheel bears on which support, and which way its rocker turns.
         self._bearing = np.zeros((len(self._supports), len(wheels)))
         self._senses = np.ones(len(self._supports))
-        for k, (_, borne, rocker) in enumerate(self._supports):
-            self._bearing[k, borne] = 1.0
-            self._senses[k] = 1.0 if rocker == self._supports[0].rocker else -1.0
+        for k, support in enumerate(self._supports):
+            self._bearing[k, support.wheels] = 1.0
+            self._senses[k] = 1.0 if support.rocker == self._supports[0].rocker else -1.0
         base = plant.GetBodyByName("base_link", model)
-        self._base = int(base.index())
         context = plant.CreateDefaultContext()
         X_BW = base.EvalPoseInWorld(context).inverse()
         p_BCom = X_BW.multiply(plant.CalcCenterOfMassPositionInWorld(context, [model]))
-        # Bodies, their masses, and where in them the centre of mass is; the robot as one.
         names = [plant.GetModelInstanceName(instance) for instance in carried]
         allowed = "neither the robot itself nor its shell, and none twice"
         distinct = {int(instance) for instance in (*carried, model, shell)}
         require(len(distinct) == len(carried) + 2, "carried", names, allowed)
-        bodies = [
+        loads = [
             plant.get_body(index)
             for instance in carried
             for index in plant.GetBodyIndices(instance)
         ]
-        self._loads = [
-            (self._base, plant.CalcTotalMass(context, [model]), p_BCom),
-            *(
-                (
-                    int(body.index()),
-                    body.get_mass(context),
-                    body.CalcCenterOfMassInBodyFrame(context),
-                )
-                for body in bodies
-            ),
-        ]
-        self._mass = sum(mass for _, mass, _ in self._loads)
-        self._weight = self._mass * plant.gravity_field().gravity_vector()
-        self._body_poses_input = self.DeclareAbstractInputPort(
-            "body_poses", AbstractValue.Make([RigidTransform()])
+        # Bodies' masses, and where in them the centre of mass is; the robot as one.
+        self._masses = np.array(
+            [plant.CalcTotalMass(context, [model]), *(body.get_mass(context) for body in loads)]
         )
-        poses = {self._body_poses_input.ticket()}
-        # To be filled in at each step: to make them takes as long as all else.
-        self._blank_forces = self.DeclareCacheEntry(
-            "forces to be filled in",
-            ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=self._calc_blank_forces),
-            {self.nothing_ticket()},
+        self._centres_of_mass = np.array(
+            [p_BCom, *(body.CalcCenterOfMassInBodyFrame(context) for body in loads)]
         )
-        self._forces_output = self.DeclareAbstractOutputPort(
-            "forces",
-            lambda: AbstractValue.Make([ExternallyAppliedSpatialForce()]),
-            self._calc_forces,
-            poses,
+        self._weight = self._masses.sum() * plant.gravity_field().gravity_vector()
+        # What is asked at each step, and what the margin asks beside: where they are in its list.
+        sphere = plant.GetBodyByName("shell", shell)
+        self._pulled = Mechanism(plant, [*map(plant.get_body, wheels), sphere])
+        rockers = [plant.get_body(support.rocker) for support in self._supports]
+        bearers = [plant.get_body(support.body) for support in self._supports]
+        self._weighed = Mechanism(plant, [*rockers, *bearers, base, *loads])
+        self._state_input = self.DeclareVectorInputPort("state", plant.num_multibody_states())
+        state = {self._state_input.ticket()}
+        self._num_velocities = plant.num_velocities()
+        self._forces_output = self.DeclareVectorOutputPort(
+            "generalized_forces", self._num_velocities, self._calc_forces, state
         )
         self._gaps_output = self.DeclareVectorOutputPort(
-            "gaps", len(wheels), self._calc_gaps, poses
+            "gaps", len(wheels), self._calc_gaps, state
         )
-        self._margin_output = self.DeclareVectorOutputPort("margin", 1, self._calc_margin, poses)
+        self._margin_output = self.DeclareVectorOutputPort("margin", 1, self._calc_margin, state)
         self._detached_output = self.DeclareVectorOutputPort(
-            "detached", 1, self._calc_detached, poses
+            "detached", 1, self._calc_detached, state
         )
 
     @staticmethod
@@ -219,7 +212,7 @@ class MagneticAdhesion(LeafSystem):
     ) -> MagneticAdhesion:
         """Adds the block for the only robot on magnets in a plant, connected both ways.
 
-        Of several robots the forces have to be joined: `JoinForces`.
+        Of several robots the forces have to be added.
 
         Args:
             builder: of the diagram that the plant is in.
@@ -227,15 +220,18 @@ class MagneticAdhesion(LeafSystem):
             arguments: the others of the constructor.
         """
         adhesion = builder.AddSystem(MagneticAdhesion(plant=plant, **arguments))
-        builder.Connect(plant.get_body_poses_output_port(), adhesion.body_poses_input_port())
-        builder.Connect(adhesion.forces_output_port(), plant.get_applied_spatial_force_input_port())
+        builder.Connect(plant.get_state_output_port(), adhesion.state_input_port())
+        builder.Connect(
+            adhesion.generalized_forces_output_port(),
+            plant.get_applied_generalized_force_input_port(),
+        )
         return adhesion
 
-    def body_poses_input_port(self) -> InputPort:
-        """Returns the port of the poses of all bodies."""
-        return self._body_poses_input
+    def state_input_port(self) -> InputPort:
+        """Returns the port of the plant's state."""
+        return self._state_input
 
-    def forces_output_port(self) -> OutputPort:
+    def generalized_forces_output_port(self) -> OutputPort:
         """Returns the port of the forces."""
         return self._forces_output
 
@@ -251,83 +247,70 @@ class MagneticAdhesion(LeafSystem):
         """Returns the port that tells whether the robot has come off."""
         return self._detached_output
 
-    def _centres(self, poses: list[RigidTransform]) -> Array:
-        """Returns where the wheels' middles are, and last the shell's centre, (n + 1, 3) m."""
-        return np.array([poses[body].translation() for body in self._pulled])
-
-    def _wheels_seen(self, poses: list[RigidTransform]) -> tuple[Array, Array]:
-        """Returns where the wheels' middles are from the shell's centre, (n, 3) m, and how far."""
-        *wheels, centre = self._centres(poses)
-        offsets = np.array(wheels) - centre
-        return offsets, np.sqrt((offsets * offsets).sum(axis=1))
-
-    def _gap(self, distances: Array) -> Array:
-        return distances - (self._shell_radius + self._wheel_radius)
-
     def _calc_forces(self, context: Context, output: Any) -> None:
-        F = np.zeros((len(self._pulled), 6))
-        magnets = self._parameters
+        bodies, magnets, tau = self._pulled, self._parameters, np.zeros(self._num_velocities)
         _pull(
-            self._centres(self._body_poses_input.Eval(context)),
-            self._shell_radius + self._wheel_radius, float(magnets.force), float(magnets.gap), F,
+            bodies.links, bodies.shapes, bodies.places, packed(self._state_input.Eval(context)),
+            self._reach, float(magnets.force), float(magnets.gap), tau,
         )  # fmt: skip
-        forces = self._blank_forces.Eval(context)
-        for force, F_W in zip(forces, F, strict=True):
-            force.F_Bq_W = SpatialForce(F_W)
-        output.set_value(forces)
-
-    def _calc_blank_forces(self, context: Context, output: AbstractValue) -> None:
-        del context
-        forces = [ExternallyAppliedSpatialForce() for _ in self._bodies]
-        for force, body in zip(forces, self._bodies, strict=True):
-            force.body_index = body
-        output.set_value(forces)
+        output.SetFromVector(tau)
 
     def _calc_gaps(self, context: Context, output: Any) -> None:
-        output.SetFromVector(self._gap(self._wheels_seen(self._body_poses_input.Eval(context))[1]))
+        output.SetFromVector(self._wheels_seen(context)[1] - self._reach)
 
     def _calc_detached(self, context: Context, output: Any) -> None:
-        gaps = self._gap(self._wheels_seen(self._body_poses_input.Eval(context))[1])
+        gaps = self._wheels_seen(context)[1] - self._reach
         output.SetFromVector([float(gaps.min() > self._parameters.detached_gap)])
 
+    def _wheels_seen(self, context: Context) -> tuple[Array, Array, Array]:
+        """Returns where the wheels' middles are from the shell's centre, (n, 3) m; how far; it."""
+        *wheels, centre = self._pulled.poses(self._state_input.Eval(context))[1]
+        offsets = np.array(wheels) - centre
+        return offsets, np.sqrt((offsets * offsets).sum(axis=1)), centre
+
     def _calc_margin(self, context: Context, output: Any) -> None:
-        poses = self._body_poses_input.Eval(context)
-        centre = poses[self._shell].translation()
-        offsets, distances = self._wheels_seen(poses)
+        offsets, distances, centre = self._wheels_seen(context)
         contacts = offsets * (self._shell_radius / distances)[:, None]
-        moment = sum(mass * poses[body].multiply(p) for body, mass, p in self._loads)
+        R, p = self._weighed.poses(self._state_input.Eval(context))
+        p, base = p - centre, 2 * len(self._supports)
+        moments = self._masses @ (
+            p[base:] + np.einsum("nij,nj->ni", R[base:], self._centres_of_mass)
+        )
         margin = adhesion_margin(
             contacts=contacts,
-            pulls=magnet_force(self._gap(distances), self._parameters),
+            pulls=magnet_force(distances - self._reach, self._parameters),
             weight=self._weight,
-            centre_of_mass=moment / self._mass - centre,
+            centre_of_mass=moments / self._masses.sum(),
             friction=self._friction,
-            suspension=self._suspension(poses, contacts) if self._supports else None,
+            suspension=self._suspension(contacts, p[:base], R[base, :, 1]),
         )
         output.SetFromVector([margin])
 
-    def _suspension(self, poses: list[RigidTransform], contacts: Array) -> Suspension:
-        centre = poses[self._shell].translation()
-        supports = np.array(
-            [
-                contacts[wheels[0]] if pivot is None else poses[pivot].translation() - centre
-                for pivot, wheels, _ in self._supports
-            ]
-        )
-        rockers = np.array(
-            [poses[rocker].translation() - centre for _, _, rocker in self._supports]
-        )
-        axis = cross_matrix(poses[self._base].rotation().matrix()[:, 1])
-        sway = self._senses[:, None] * ((supports - rockers) @ axis.T)
+    def _suspension(self, contacts: Array, p: Array, y: Array) -> Suspension | None:
+        """Returns what bears the robot.
+
+        Args:
+            contacts: (n, 3) of the wheels from the shell's centre, m.
+            p: (2 m, 3) of the supports' rockers, then of the supports, likewise.
+            y: (3,) the robot's axis.
+        """
+        if not self._supports:
+            return None
+        rockers, supports = np.split(p, 2)
+        for k, support in enumerate(self._supports):
+            if support.is_wheel:
+                supports[k] = contacts[support.wheels[0]]
+        sway = self._senses[:, None] * ((supports - rockers) @ cross_matrix(y).T)
         return Suspension(supports, self._bearing, sway)
 
 
 class _Support(NamedTuple):
-    """Where a robot on rockers rests: indices of bodies, and of the wheels that bear on it."""
+    """Where a robot on rockers rests."""
 
-    pivot: int | None  # of a bogie; None for a wheel's own contact
-    wheels: list[int]
-    rocker: int
+    body: BodyIndex  # a bogie, with its pivot as its origin, or a wheel
+    is_wheel: bool  # it bears on the shell itself
+    wheels: list[int]  # numbers of those that bear on it
+    rocker: BodyIndex
 
 
 def _supports(plant: MultibodyPlant, wheels: list[BodyIndex]) -> list[_Support]:
@@ -335,81 +318,14 @@ def _supports(plant: MultibodyPlant, wheels: list[BodyIndex]) -> list[_Support]:
     joints = [plant.get_joint(index) for index in plant.GetJointIndices()]
     mounts = {int(joint.child_body().index()): joint.parent_body() for joint in joints}
     found: dict[int, _Support] = {}
-    for place, wheel in enumerate(wheels):
-        mount = mounts.get(int(wheel))
-        pivot = None
+    for number, wheel in enumerate(wheels):
+        body, mount = wheel, mounts.get(int(wheel))
         if mount is not None and mount.name().endswith("_bogie"):
-            pivot = int(mount.index())
-            mount = mounts.get(pivot)
+            body = mount.index()
+            mount = mounts.get(int(body))
         if mount is None or not mount.name().endswith("_rocker"):
             return []
-        key = int(wheel) if pivot is None else pivot
-        found.setdefault(key, _Support(pivot, [], int(mount.index()))).wheels.append(place)
+        support = _Support(body, body == wheel, [], mount.index())
+        found.setdefault(int(body), support).wheels.append(number)
     supports = list(found.values())
-    return supports if len({support.rocker for support in supports}) == 2 else []
-
-
-class JoinForces(LeafSystem):
-    """Joins the forces of several robots for the plant, which takes them on one port.
-
-    .. pydrake_system::
-
-        name: JoinForces
-        input_ports:
-        - "forces_{k}"
-        output_ports:
-        - forces
-
-    Args:
-        robots: how many, n.
-
-    Ports:
-        forces_{k} (input, list): of one of them, such as `MagneticAdhesion` sends.
-        forces (output, list): all of them, in that order, for `applied_spatial_force`.
-
-    Raises:
-        ValueError: no robot.
-    """
-
-    def __init__(self, *, robots: int) -> None:
-        super().__init__()
-        require(robots >= 1, "robots", robots, "at least 1")
-        model = AbstractValue.Make([ExternallyAppliedSpatialForce()])
-        self._inputs = [
-            self.DeclareAbstractInputPort(f"forces_{k + 1}", model) for k in range(robots)
-        ]
-        self._forces_output = self.DeclareAbstractOutputPort(
-            "forces",
-            lambda: AbstractValue.Make([ExternallyAppliedSpatialForce()]),
-            self._calc_forces,
-            {port.ticket() for port in self._inputs},
-        )
-
-    @staticmethod
-    def AddToBuilder(
-        builder: DiagramBuilder, plant: MultibodyPlant, adhesions: Sequence[MagneticAdhesion]
-    ) -> JoinForces:
-        """Adds the block for all robots on magnets in a plant, which are connected both ways.
-
-        Args:
-            builder: of the diagram that the plant is in.
-            plant: finalized.
-            adhesions: in the diagram, not connected yet.
-        """
-        joined = builder.AddSystem(JoinForces(robots=len(adhesions)))
-        for k, adhesion in enumerate(adhesions):
-            builder.Connect(plant.get_body_poses_output_port(), adhesion.body_poses_input_port())
-            builder.Connect(adhesion.forces_output_port(), joined.forces_input_port(k + 1))
-        builder.Connect(joined.forces_output_port(), plant.get_applied_spatial_force_input_port())
-        return joined
-
-    def forces_input_port(self, k: int) -> InputPort:
-        """Returns the port of the k-th robot's forces, k from 1."""
-        return self._inputs[k - 1]
-
-    def forces_output_port(self) -> OutputPort:
-        """Returns the port of all forces."""
-        return self._forces_output
-
-    def _calc_forces(self, context: Context, output: Any) -> None:
-        output.set_value([force for port in self._inputs for force in port.Eval(context)])
+    return supports if len({int(support.rocker) for support in supports}) == 2 else []

@@ -29,7 +29,6 @@ from pydrake.geometry import (
     Role,
 )
 from pydrake.math import RigidTransform, RollPitchYaw
-from pydrake.multibody.math import SpatialForce
 from pydrake.multibody.plant import AddMultibodyPlantSceneGraph, ExternallyAppliedSpatialForce
 from pydrake.multibody.tree import SpatialInertia
 from pydrake.systems.analysis import Simulator
@@ -59,7 +58,7 @@ from plants.differential_drive import (
     add_differential_drive,
     wheel_speeds,
 )
-from plants.magnets import JoinForces, MagneticAdhesion
+from plants.magnets import MagneticAdhesion
 from plants.motors import DcMotors, MotorModel, MotorParameters
 from plants.moving import MovingCylinder, MovingObstacles
 from plants.planar_shapes import PlanarShapes
@@ -258,11 +257,11 @@ def magnetic_adhesion(_: Path) -> Case:
     plant.Finalize()
     context = plant.CreateDefaultContext()
     X_RB = stance(np.zeros(3), SnailBotParameters(), ShellParameters())
-    poses = []
+    states = []
     for height in (0.0, 0.02):  # on the shell, off it
         X_WB = X_RB @ RigidTransform([0.0, 0.0, height])
         plant.SetFreeBodyPose(context, plant.GetBodyByName("base_link", model), X_WB)
-        poses.append(plant.get_body_poses_output_port().Eval(context))
+        states.append(plant.get_state_output_port().Eval(context).copy())
     system = MagneticAdhesion(
         plant=plant,
         model=model,
@@ -270,13 +269,7 @@ def magnetic_adhesion(_: Path) -> Case:
         wheel_radius=SnailBotParameters().wheel_radius,
         shell_parameters=ShellParameters(),
     )
-    return Case(system, {"body_poses": (poses[0], poses[1])})
-
-
-def join_forces(_: Path) -> Case:
-    first, second = ExternallyAppliedSpatialForce(), ExternallyAppliedSpatialForce()
-    second.F_Bq_W = SpatialForce(np.ones(6))
-    return Case(JoinForces(robots=2), {f"forces_{k}": ([first], [first, second]) for k in (1, 2)})
+    return Case(system, {"state": (states[0], states[1])})
 
 
 def recorder(folder: Path) -> Case:
@@ -552,7 +545,6 @@ CASES: dict[type, Callable[[Path], Case]] = {
             "spatial_acceleration": vector(0.6, 0.5, 0.4, 0.3, 0.2, 0.1),
         },
     ),
-    JoinForces: join_forces,
     KnownShellMotion: lambda _: Case(
         KnownShellMotion(),
         {"pose": POSES, "spatial_velocity": vector(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)},

@@ -152,8 +152,8 @@ class SnailBotBody:
             ),
             f"{robot.name}.magnets",
         )
-        station.connect(plant.get_body_poses_output_port(), adhesion.body_poses_input_port())
-        station.pulls.append(adhesion.forces_output_port())
+        station.connect(plant.get_state_output_port(), adhesion.state_input_port())
+        station.pulls.append(adhesion.generalized_forces_output_port())
         for name, rate in (("margin", 10.0), ("detached", 10.0)):
             signal = number_signal(f"truth.{robot.name}.{name}", rate)
             station.export_output(adhesion.GetOutputPort(name), signal.port, signal)

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
+from pydrake.multibody.tree import JacobianWrtVariable
 from pydrake.systems.framework import DiagramBuilder
 from scipy.optimize import linprog
 
 from plants.adhesion_margin import Suspension, adhesion_margin
-from plants.magnets import JoinForces, MagneticAdhesion, MagnetParameters, magnet_force
+from plants.magnets import MagneticAdhesion, MagnetParameters, magnet_force
 from plants.shell import ShellParameters, add_shell, pose_on_shell
 from plants.snailbot import SnailBotParameters, add_snailbot, wheel_centres
 from tests.plants.two_robots import TwoRobots
@@ -265,25 +266,54 @@ class Rig:
         )
 
 
+def generalized(plant: Any, context: Any, pulls: list[tuple[Any, np.ndarray]]) -> np.ndarray:
+    """What forces on the origins of bodies do to the joints, by Drake's Jacobians."""
+    world, total = plant.world_frame(), np.zeros(plant.num_velocities())
+    for body, force in pulls:
+        J = plant.CalcJacobianTranslationalVelocity(
+            context, JacobianWrtVariable.kV, body.body_frame(), np.zeros(3), world, world
+        )
+        total += J.T @ force
+    return total
+
+
+def pulls_between(
+    plant: Any, context: Any, model: Any, shell: Any, force: float
+) -> list[tuple[Any, np.ndarray]]:
+    """The six wheels' pulls to the shell's centre, where they touch it, and their reaction."""
+    pulls, reaction = [], np.zeros(3)
+    centre = shell.EvalPoseInWorld(context).translation()
+    for body in map(plant.get_body, plant.GetBodyIndices(model)):
+        if body.name().endswith("_wheel"):
+            inward = centre - body.EvalPoseInWorld(context).translation()
+            pulls.append((body, force * inward / np.linalg.norm(inward)))
+            reaction -= pulls[-1][1]
+    assert len(pulls) == 6
+    return [*pulls, (shell, reaction)]
+
+
 def test_the_magnets_pull_to_the_centre_and_the_shell_is_pulled_back() -> None:
     rig = Rig(force=2.0)
     rig.put([30, 40, 50])
-    *pulls, reaction = rig.output("forces")
-    assert len(pulls) == 6
-    names = {rig.plant.get_body(force.body_index).name() for force in pulls}
-    sides = ("right", "left")
-    ends = ("front", "middle", "rear")
-    assert names == {f"{side}_{end}_wheel" for side in sides for end in ends}
-    for force in pulls:
-        wheel = rig.plant.get_body(force.body_index).EvalPoseInWorld(rig.plant_context)
-        inward = rig.X_WR.translation() - wheel.translation()
-        np.testing.assert_allclose(
-            force.F_Bq_W.translational(), 2.0 * inward / np.linalg.norm(inward), atol=1e-9
-        )
-    assert rig.plant.get_body(reaction.body_index).name() == "shell"
-    total = np.sum([force.F_Bq_W.get_coeffs() for force in [*pulls, reaction]], axis=0)
-    np.testing.assert_allclose(total, 0.0, atol=1e-12)
-    assert all(np.array_equal(force.p_BoBq_B, np.zeros(3)) for force in [*pulls, reaction])
+    joints = ["right_rocker", "left_rocker", "right_bogie", "left_bogie", "left_rear_wheel"]
+    for name, angle in zip(joints, [0.05, -0.05, 0.1, -0.02, 1.3], strict=True):
+        joint = rig.plant.GetJointByName(name, rig.model)
+        joint.set_angle(rig.plant_context, angle)
+    # Only turned within the robot, its wheels are up to a millimetre off the shell.
+    shell = rig.plant.GetBodyByName("shell")
+    expected = []
+    for (body, force), gap in zip(
+        pulls_between(rig.plant, rig.plant_context, rig.model, shell, 1.0),
+        [*rig.output("gaps"), 0.0],
+        strict=True,
+    ):
+        expected.append((body, force * magnet_force(gap, MagnetParameters(force=2.0))))
+    assert np.ptp(rig.output("gaps")) > 5e-4
+    told = rig.output("generalized_forces")
+    np.testing.assert_allclose(
+        told, generalized(rig.plant, rig.plant_context, expected[:6]), atol=1e-12
+    )  # the shell stands: its reaction moves nothing
+    assert np.abs(told).max() > 1.0
 
 
 def test_lifted_off_it_is_detached() -> None:
@@ -291,19 +321,21 @@ def test_lifted_off_it_is_detached() -> None:
     rig.put([0, 20, 70])
     np.testing.assert_allclose(rig.output("gaps"), 0.0, atol=1e-12)
     assert rig.output("detached") == 0.0
-    near = sum(np.linalg.norm(f.F_Bq_W.translational()) for f in rig.output("forces")[:6])
+    base = rig.plant.GetBodyByName("base_link", rig.model)
+    start = base.floating_velocities_start_in_v()
+    on_base = slice(start + 3, start + 6)
+    near = np.linalg.norm(rig.output("generalized_forces")[on_base])
     rig.put([0, 20, 70], above=0.003)
     assert rig.output("gaps").min() > 0.002
     assert rig.output("detached") == 0.0
     rig.put([0, 20, 70], above=0.01)
     assert rig.output("detached") == 1.0
-    far = sum(np.linalg.norm(f.F_Bq_W.translational()) for f in rig.output("forces")[:6])
-    assert far < near / 50
+    far = np.linalg.norm(rig.output("generalized_forces")[on_base])
+    assert 0 < far < near / 50
     # Tilted, with one side on the shell, it is not.
     X_RB = pose_on_shell(np.radians([0, 20, 70]), 0.085)
     p_BWheel = np.array([0.0, 0.036, -0.01])
     tilt = RigidTransform(RollPitchYaw(-0.3, 0, 0), p_BWheel) @ RigidTransform(-p_BWheel)
-    base = rig.plant.GetBodyByName("base_link", rig.model)
     rig.plant.SetFreeBodyPose(rig.plant_context, base, rig.X_WR @ X_RB @ tilt)
     assert rig.output("gaps").max() > 0.01
     assert rig.output("detached") == 0.0
@@ -369,8 +401,9 @@ def test_what_it_carries_weighs_on_it() -> None:
     everything = [*rig.robots, rig.shells[1]]
     total = rig.plant.CalcTotalMass(rig.plant_context, everything)
     block = rig.adhesions[0]
-    poses = rig.plant.get_body_poses_output_port().Eval(rig.plant_context)
-    com = sum(mass * poses[body].multiply(p) for body, mass, p in block._loads) / total
+    R, p = block._weighed.poses(rig.plant.get_state_output_port().Eval(rig.plant_context))
+    own = slice(-len(block._masses), None)
+    com = block._masses @ (p[own] + (R[own] @ block._centres_of_mass[..., None])[..., 0]) / total
     expected = rig.plant.CalcCenterOfMassPositionInWorld(rig.plant_context, everything)
     np.testing.assert_allclose(com, expected, atol=1e-9)
     assert total == pytest.approx(2 * 0.242 + 0.28)
@@ -402,21 +435,15 @@ def test_what_it_cannot_carry_is_refused(wrong: str) -> None:
 
 
 def test_the_forces_of_all_robots_reach_the_plant() -> None:
-    rig = TwoRobots([0.0, 0.0, 0.0])
-    port = rig.plant.get_applied_spatial_force_input_port()
-    reached = port.Eval(rig.plant_context)
-    sent = [force for k in (0, 1) for force in rig.output(k, "forces")]
-    assert len(reached) == len(sent) == 14
-    for a, b in zip(reached, sent, strict=True):
-        assert a.body_index == b.body_index
-        np.testing.assert_array_equal(a.F_Bq_W.get_coeffs(), b.F_Bq_W.get_coeffs())
-    # Between robots and shells alone: nothing is pulled by the world.
-    total = np.sum([force.F_Bq_W.get_coeffs() for force in reached], axis=0)
-    np.testing.assert_allclose(total, 0.0, atol=1e-12)
-    names = [rig.plant.get_body(force.body_index).scoped_name().get_full() for force in reached]
-    assert names.count("one_shell::shell") == 1
-
-
-def test_joining_nothing_is_refused() -> None:
-    with pytest.raises(ValueError, match="robots is 0: must be at least 1"):
-        JoinForces(robots=0)
+    rig = TwoRobots([0.0, 0.0, 0.0], forces=(2.0, 3.0))
+    port = rig.plant.get_applied_generalized_force_input_port()
+    expected = np.zeros(rig.plant.num_velocities())
+    for k, force in enumerate((2.0, 3.0)):
+        shell = rig.plant.GetBodyByName("shell", rig.shells[k])
+        pulls = pulls_between(rig.plant, rig.plant_context, rig.robots[k], shell, force)
+        expected += generalized(rig.plant, rig.plant_context, pulls)
+    np.testing.assert_allclose(port.Eval(rig.plant_context), expected, atol=1e-9)
+    # The lower one is pulled at from above too: by the reaction on the shell that it carries.
+    lower = rig.plant.GetBodyByName("base_link", rig.robots[0]).floating_velocities_start_in_v()
+    alone = rig.output(0, "generalized_forces")[lower + 3 : lower + 6]
+    assert np.linalg.norm(expected[lower + 3 : lower + 6] - alone) > 1.0

@@ -11,8 +11,9 @@ from pydrake.multibody.plant import AddMultibodyPlant, MultibodyPlantConfig
 from pydrake.multibody.tree import ModelInstanceIndex
 from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import DiagramBuilder
+from pydrake.systems.primitives import Adder
 
-from plants.magnets import JoinForces, MagneticAdhesion, MagnetParameters
+from plants.magnets import MagneticAdhesion, MagnetParameters
 from plants.shell import ShellParameters, add_shell
 from plants.snailbot import (
     SnailBotParameters,
@@ -80,7 +81,11 @@ class TwoRobots:
             )
             for k in (0, 1)
         ]
-        JoinForces.AddToBuilder(builder, plant, self.adhesions)
+        total = builder.AddSystem(Adder(2, plant.num_velocities()))
+        for k, adhesion in enumerate(self.adhesions):
+            builder.Connect(plant.get_state_output_port(), adhesion.state_input_port())
+            builder.Connect(adhesion.generalized_forces_output_port(), total.get_input_port(k))
+        builder.Connect(total.get_output_port(), plant.get_applied_generalized_force_input_port())
         for k in (0, 1):
             builder.ExportInput(plant.get_desired_state_input_port(self.robots[k]), f"servos_{k}")
         self.diagram = builder.Build()
