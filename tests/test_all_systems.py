@@ -63,7 +63,8 @@ from plants.motors import DcMotors, MotorModel, MotorParameters
 from plants.moving import MovingCylinder, MovingObstacles
 from plants.planar_shapes import PlanarShapes
 from plants.relative_pose import FramePose, RelativePose
-from plants.rocking import RockingBody, RockingParameters
+from plants.rocking import RockingBody
+from plants.rocking_motion import RockingParameters
 from plants.shell import ShellMotion, ShellParameters, add_shell
 from plants.shell_rover import ShellRover
 from plants.snailbot import SnailBotParameters, add_snailbot, stance

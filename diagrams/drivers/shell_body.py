@@ -16,7 +16,8 @@ from diagrams.station import Robot, StationBuilder
 from plants.body_state import BodyState
 from plants.magnets import MagneticAdhesion, MagnetParameters
 from plants.relative_pose import RelativePose
-from plants.rocking import RockingBody, RockingParameters
+from plants.rocking import RockingBody
+from plants.rocking_motion import RockingParameters
 from plants.shell import ShellParameters, add_shell
 from plants.snailbot import (
     SnailBotParameters,

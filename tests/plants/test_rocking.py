@@ -11,7 +11,8 @@ from pydrake.systems.analysis import Simulator
 from pydrake.systems.framework import Context, DiagramBuilder
 from scipy.spatial.transform import Rotation
 
-from plants.rocking import RockingBody, RockingParameters, Waves, draw_waves, tilt, tilted
+from plants.rocking import RockingBody
+from plants.rocking_motion import RockingParameters, Waves, draw_waves, tilt, tilted
 from systems.noise import generator, stream_key
 from systems.sensors.imu import ideal_sample
 
