@@ -27,7 +27,8 @@ from systems.flow.projector import FlowProjectorParameters, project_flow
 from systems.flow.shell import ShellView
 from systems.flow.sphere_flow import SphereFlowEstimator, SphereFlowParameters
 from systems.messages import PointMatches, PoseEstimate, RotationIncrement
-from systems.sensors.imu import GRAVITY, Bmi088Parameters, digital, piece_errors
+from systems.sensors.imu import digital, piece_errors
+from systems.sensors.imu_parameters import GRAVITY, Bmi088Parameters
 from systems.shell.angles import rotation, rotation_error, rotation_vector
 from systems.shell.layout import misplaced
 from systems.shell.marker_pose import shell_localizer

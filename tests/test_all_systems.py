@@ -151,7 +151,8 @@ from systems.planners.waypoint_sequencer import WaypointSequencer
 from systems.pose_vector import PoseFromVector, PoseToVector
 from systems.sensors.drawn_camera import DrawnCamera
 from systems.sensors.faults import Fault, FaultInjector
-from systems.sensors.imu import Imu, ImuParameters
+from systems.sensors.imu import Imu
+from systems.sensors.imu_parameters import ImuParameters
 from systems.sensors.lidar import Lidar, LidarParameters
 from systems.sensors.missed_passages import MissedPassages
 from systems.sensors.pose_outliers import PoseOutliers

@@ -10,7 +10,8 @@ import numpy as np
 from diagrams.channels import imu_signal
 from diagrams.station import Robot, StationBuilder
 from systems.estimators.gyro_yaw import GyroYaw
-from systems.sensors.imu import Bmi088Parameters, Imu, ImuParameters, Mpu6050Parameters
+from systems.sensors.imu import Imu
+from systems.sensors.imu_parameters import Bmi088Parameters, ImuParameters, Mpu6050Parameters
 from systems.validation import require, require_non_negative, require_positive
 
 

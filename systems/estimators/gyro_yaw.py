@@ -11,7 +11,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.angles import wrap
 from systems.health import Counts
-from systems.sensors.imu import GRAVITY
+from systems.sensors.imu_parameters import GRAVITY
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]

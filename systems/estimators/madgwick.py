@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
-from systems.sensors.imu import GRAVITY
+from systems.sensors.imu_parameters import GRAVITY
 from systems.validation import require_non_negative, require_positive
 
 Quaternion = tuple[float, float, float, float]

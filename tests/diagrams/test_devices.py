@@ -19,7 +19,7 @@ from diagrams.station import Station
 from plants.motors import MotorModel, MotorParameters
 from systems.controllers.wheel_pwm import pulse_widths
 from systems.io.bag import BagReader
-from systems.sensors.imu import GRAVITY, Mpu6050Parameters
+from systems.sensors.imu_parameters import GRAVITY, Mpu6050Parameters
 
 R, BASE = 0.0325, 0.16
 ENCODERS = "robot.sensors.encoders={type: wheel_encoders, ticks_per_turn: 960}"

@@ -23,7 +23,8 @@ from plants.differential_drive import (
 )
 from systems.markers.family import family
 from systems.markers.layout import MarkerMap
-from systems.sensors.imu import GRAVITY, ideal_sample
+from systems.sensors.imu import ideal_sample
+from systems.sensors.imu_parameters import GRAVITY
 
 DEFAULT = DifferentialDriveParameters()
 LARGE = DifferentialDriveParameters(

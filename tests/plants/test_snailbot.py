@@ -31,7 +31,8 @@ from plants.snailbot import (
     wheel_centres,
     wheel_speeds,
 )
-from systems.sensors.imu import GRAVITY, ideal_sample
+from systems.sensors.imu import ideal_sample
+from systems.sensors.imu_parameters import GRAVITY
 from systems.shell.angles import angle_differences, rotation, rotation_error
 from tests.plants.two_robots import TwoRobots
 

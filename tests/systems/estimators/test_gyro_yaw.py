@@ -10,7 +10,8 @@ from pydrake.systems.framework import DiagramBuilder, LeafSystem
 
 from systems.angles import wrap
 from systems.estimators.gyro_yaw import AT_REST, GyroYaw, offsets
-from systems.sensors.imu import GRAVITY, Imu, Mpu6050Parameters
+from systems.sensors.imu import Imu
+from systems.sensors.imu_parameters import GRAVITY, Mpu6050Parameters
 
 RATE = 50.0
 

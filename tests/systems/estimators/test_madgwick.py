@@ -25,7 +25,8 @@ from systems.estimators.madgwick import (
     madgwick_step,
     tilt_of,
 )
-from systems.sensors.imu import GRAVITY, Bmi088Parameters, Imu, ImuParameters
+from systems.sensors.imu import Imu
+from systems.sensors.imu_parameters import GRAVITY, Bmi088Parameters, ImuParameters
 
 Array = NDArray[np.float64]
 

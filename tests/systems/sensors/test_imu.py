@@ -15,14 +15,12 @@ from scipy.signal import periodogram
 
 from plants.body_state import BodyState
 from systems.noise import generator, stream_key
-from systems.sensors.imu import (
+from systems.sensors.imu import Imu, ideal_sample, piece_errors
+from systems.sensors.imu_parameters import (
     GRAVITY,
     Bmi088Parameters,
-    Imu,
     ImuParameters,
     Mpu6050Parameters,
-    ideal_sample,
-    piece_errors,
 )
 
 # --- What a perfect sensor measures ---
