@@ -9,10 +9,11 @@ same object means the same result. It is a cache entry, so each Context has its 
 from __future__ import annotations
 
 from collections.abc import Callable
+from operator import is_
 from typing import Any
 
 from pydrake.common.value import AbstractValue
-from pydrake.systems.framework import Context, LeafSystem, ValueProducer
+from pydrake.systems.framework import Context, DependencyTicket, LeafSystem, ValueProducer
 
 
 class Memo:
@@ -21,18 +22,24 @@ class Memo:
     Args:
         system: the block that owns the memo; call this in its constructor.
         name: what is remembered, for Drake's diagnostics.
+        reads: what the function reads of the Context besides its inputs, state for example; when
+            that changes, all is forgotten.
     """
 
-    def __init__(self, system: LeafSystem, name: str) -> None:
+    def __init__(
+        self, system: LeafSystem, name: str, reads: set[DependencyTicket] | None = None
+    ) -> None:
         self._entry = system.DeclareCacheEntry(
             f"memo of {name}",
-            ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=ValueProducer.NoopCalc),
-            {system.nothing_ticket()},
+            ValueProducer(
+                allocate=lambda: AbstractValue.Make([]), calc=lambda _, slot: slot.set_value([])
+            ),
+            reads or {system.nothing_ticket()},
         )
 
     def __call__(self, context: Context, function: Callable[..., Any], *inputs: Any) -> Any:
         """Returns `function(*inputs)`, computed anew only when an input is another object."""
-        slot = self._entry.get_mutable_cache_entry_value(context).GetMutableValueOrThrow()
-        if not slot or any(a is not b for a, b in zip(slot[0], inputs, strict=True)):
+        slot = self._entry.Eval(context)
+        if not slot or not all(map(is_, slot[0], inputs)):
             slot[:] = [inputs, function(*inputs)]
         return slot[1]

@@ -419,9 +419,7 @@ class Localizer(LeafSystem):
         return self._counts.output_port
 
     def _locate(self, context: Context) -> Localization:
-        return self._located(context, self._detections_input.Eval(context))
-
-    def _located(self, context: Context, detections: Detections) -> Localization:
+        detections = self._detections_input.Eval(context)
         found: Localization = self._memo(context, self._localizer.locate, detections)
         return found
 
@@ -430,5 +428,5 @@ class Localizer(LeafSystem):
         last_stamp = context.get_discrete_state(self._last_stamp)[0]
         if math.isfinite(detections.stamp) and detections.stamp != last_stamp:
             discrete_state.set_value(self._last_stamp, [detections.stamp])
-            dropped = self._located(context, detections).dropped
+            dropped = self._locate(context).dropped
             self._counts.add(context, discrete_state, **dropped)

@@ -12,6 +12,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
+from systems.memo import Memo
 from systems.messages import Detections
 from systems.noise import NoiseStream
 from systems.validation import require, require_positive
@@ -40,13 +41,13 @@ def passages_after(
         (m, 4) likewise, the latest seen last, and the number.
     """
     stamp = detections.stamp
-    going = {int(row[_ID]): row for row in passages if stamp - row[_LAST] < gap}
+    going = {int(row[_ID]): row for row in passages.tolist() if stamp - row[_LAST] < gap}
     for marker in detections.ids.tolist():
         row = going.pop(marker, None)
         if row is None:
             number += 1
-            row = np.array([marker, stamp, missed(number, marker), number], float)
-        going[marker] = np.array([marker, stamp, *row[_MISSED:]])
+            row = [marker, stamp, missed(number, marker), number]
+        going[marker] = [marker, stamp, *row[_MISSED:]]
     return np.array([*going.values()], float).reshape(-1, 4), number
 
 
@@ -105,16 +106,17 @@ class MissedPassages(LeafSystem):
         self._passages = self.DeclareDiscreteState(np.full(4 * _MANY, math.nan))
         # Stamp of the last picture, and how many passages there have been.
         self._past = self.DeclareDiscreteState([math.nan, 0.0])
+        reads = {
+            self.discrete_state_ticket(self._passages),
+            self.discrete_state_ticket(self._past),
+            self.all_parameters_ticket(),
+        }
+        self._memo = Memo(self, "the last picture", reads)
         self._seen_output = self.DeclareAbstractOutputPort(
             "seen",
             lambda: AbstractValue.Make(Detections()),
             self._calc_seen,
-            {
-                self._detections_input.ticket(),
-                self.discrete_state_ticket(self._passages),
-                self.discrete_state_ticket(self._past),
-                self.all_parameters_ticket(),
-            },
+            {self._detections_input.ticket(), *reads},
         )
         self._counts = Counts(self, "missed", "missed_passages")
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
@@ -131,48 +133,53 @@ class MissedPassages(LeafSystem):
         """Returns the port of the counts."""
         return self._counts.output_port
 
-    def _after(self, context: Context) -> tuple[Detections, Array, int]:
-        """Returns the picture, the passages that it belongs to, and how many there have been."""
-        detections: Detections = self._detections_input.Eval(context)
+    def _sifted(self, context: Context, detections: Detections) -> tuple[Detections, Array, int]:
+        """Returns what is seen of a picture, the passages then, and how many there have been."""
+        found: tuple[Detections, Array, int] = self._memo(
+            context, lambda picture: self._sift(context, picture), detections
+        )
+        return found
+
+    def _sift(self, context: Context, detections: Detections) -> tuple[Detections, Array, int]:
         passages = context.get_discrete_state(self._passages).get_value().reshape(-1, 4)
         passages = passages[~np.isnan(passages[:, _ID])]
-        past, number = context.get_discrete_state(self._past).get_value().tolist()
-        if math.isnan(detections.stamp) or detections.stamp == past:
-            return detections, passages, int(number)
+        past, before = context.get_discrete_state(self._past).get_value().tolist()
+        number = int(before)
 
         def missed(n: int, marker: int) -> bool:
             random = self._noise.generator(context, (n << 32) + marker)
             return n > 1 and bool(random.random() < self._probability)
 
-        passages, number = passages_after(
-            passages, int(number), detections, gap=self._gap, missed=missed
-        )
-        return detections, passages[-_MANY:], number
+        if not (math.isnan(detections.stamp) or detections.stamp == past):
+            passages, number = passages_after(
+                passages, number, detections, gap=self._gap, missed=missed
+            )
+            passages = passages[-_MANY:]
+        gone = passages[passages[:, _MISSED] == 1, _ID].tolist()
+        shown = [marker not in gone for marker in detections.ids.tolist()]
+        seen = detections if all(shown) else detections.select(np.array(shown))
+        return seen, passages, number
 
     def _calc_seen(self, context: Context, output: Any) -> None:
         detections: Detections = self._detections_input.Eval(context)
-        if not len(detections):
-            output.set_value(detections)
-            return
-        _, passages, _ = self._after(context)
-        hidden = np.isin(detections.ids, passages[passages[:, _MISSED] == 1, _ID])
-        output.set_value(detections.select(~hidden) if hidden.any() else detections)
+        output.set_value(self._sifted(context, detections)[0] if len(detections) else detections)
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if not len(self._detections_input.Eval(context)):  # the passages end by the time
+        detections: Detections = self._detections_input.Eval(context)
+        if not len(detections):  # the passages end by the time
             return
-        detections, passages, number = self._after(context)
         past, before = context.get_discrete_state(self._past).get_value().tolist()
         if math.isnan(detections.stamp) or detections.stamp == past:
             return
+        seen, passages, number = self._sifted(context, detections)
         rows = np.full((_MANY, 4), math.nan)
         rows[: len(passages)] = passages
         discrete_state.set_value(self._passages, rows.ravel())
         discrete_state.set_value(self._past, [detections.stamp, number])
-        gone = passages[passages[:, _MISSED] == 1]
+        new = (passages[:, _MISSED] == 1) & (passages[:, _NUMBER] > before)
         self._counts.add(
             context,
             discrete_state,
-            missed=int(np.isin(detections.ids, gone[:, _ID]).sum()),
-            missed_passages=int((gone[:, _NUMBER] > before).sum()),
+            missed=len(detections) - len(seen),
+            missed_passages=int(new.sum()),
         )

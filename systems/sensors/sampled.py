@@ -35,7 +35,12 @@ class _Samples(Message):
 
     def arrived(self, t: float) -> int:
         """Returns how many have arrived at time t (s)."""
-        return sum(due <= t + _ROUNDING for due, _ in self.samples)
+        count = 0
+        for due, _ in self.samples:
+            if due > t + _ROUNDING:
+                break
+            count += 1
+        return count
 
 
 class SampledSensor(LeafSystem):
@@ -87,13 +92,14 @@ class SampledSensor(LeafSystem):
         self.clock_error = clock_error
         self._active_input = self.DeclareVectorInputPort("active", 1) if switchable else None
         self._nothing = nothing
-        self._samples = self.DeclareAbstractState(AbstractValue.Make(_Samples()))
+        samples = self.DeclareAbstractState(AbstractValue.Make(_Samples()))
+        self._samples = int(samples)
         self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._take)
         return self.DeclareAbstractOutputPort(
             name,
             lambda: AbstractValue.Make(nothing),
             self._calc_arrived,
-            {self.abstract_state_ticket(self._samples), self.time_ticket()},
+            {self.abstract_state_ticket(samples), self.time_ticket()},
         )
 
     @abstractmethod
@@ -126,13 +132,13 @@ class SampledSensor(LeafSystem):
             return EventStatus.DidNothing()
         t = context.get_time()
         message = self._measure(context, self._stamp(t), sample_index(t, self.rate))
-        slot: AbstractValue = state.get_mutable_abstract_state(int(self._samples))
+        slot: AbstractValue = state.get_mutable_abstract_state(self._samples)
         before: _Samples = slot.get_value()
         kept = before.samples[max(before.arrived(t) - 1, 0) :]
         slot.set_value(_Samples((*kept, (t + self.latency, message))))
         return EventStatus.Succeeded()
 
     def _calc_arrived(self, context: Context, output: Any) -> None:
-        found: _Samples = context.get_abstract_state(int(self._samples)).get_value()
+        found: _Samples = context.get_abstract_state(self._samples).get_value()
         arrived = found.arrived(context.get_time())
         output.set_value(found.samples[arrived - 1][1] if arrived else self._nothing)

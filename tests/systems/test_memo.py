@@ -91,6 +91,34 @@ def test_every_input_counts() -> None:
     assert calls == [(a, b), (a, c), (b, c)]
 
 
+class Gain(LeafSystem):
+    """Scales a number by one of its state, remembered."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.gain = self.DeclareDiscreteState([2.0])
+        self.memo = Memo(self, "scaled", {self.discrete_state_ticket(self.gain)})
+        self.calls = 0
+
+    def scaled(self, context: Context, stamp: CameraImage) -> float:
+        def function(image: CameraImage) -> float:
+            self.calls += 1
+            return float(context.get_discrete_state(self.gain)[0]) * image.stamp
+
+        return float(self.memo(context, function, stamp))
+
+
+def test_what_was_read_of_the_state_is_forgotten_when_that_changes() -> None:
+    system = Gain()
+    context = system.CreateDefaultContext()
+    image = CameraImage(stamp=3.0)
+    assert [system.scaled(context, image) for _ in range(3)] == [6.0] * 3
+    context.get_mutable_discrete_state(system.gain).SetFromVector([5.0])
+    assert [system.scaled(context, image) for _ in range(3)] == [15.0] * 3
+    assert system.scaled(context, CameraImage(stamp=4.0)) == 20.0
+    assert system.calls == 3
+
+
 def test_a_result_of_none_is_remembered_too_and_an_error_is_not() -> None:
     system = Costly()
     context = system.CreateDefaultContext()

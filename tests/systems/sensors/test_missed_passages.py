@@ -144,6 +144,30 @@ def test_the_rate_does_not_matter_and_the_seed_does() -> None:
     assert ids(seed=5) != ids(seed=5, name="another")
 
 
+def test_a_picture_is_sifted_anew_when_the_seed_or_what_is_known_of_passages_changes() -> None:
+    block = MissedPassages(probability=0.5, seed=0)
+    context = block.CreateDefaultContext()
+    told = picture(1.0, list(range(40)))
+    block.detections_input_port().FixValue(context, AbstractValue.Make(told))
+
+    def ids() -> list[int]:
+        seen: Detections = block.seen_output_port().Eval(context)
+        assert block.seen_output_port().Eval(context) is seen
+        return seen.ids.tolist()
+
+    first = ids()
+    assert 10 < len(first) < 30
+    assert first[0] == 0
+    context.get_mutable_numeric_parameter(0).SetFromVector([1.0])
+    assert ids() != first
+    context.get_mutable_numeric_parameter(0).SetFromVector([0.0])
+    assert ids() == first
+    passages = np.full((64, 4), math.nan)
+    passages[:2] = [[first[1], 0.9, 1.0, 7.0], [0, 0.9, 1.0, 8.0]]
+    context.get_mutable_discrete_state(0).SetFromVector(passages.ravel())
+    assert not {0, first[1]} & set(ids())
+
+
 def test_passages_known_answer() -> None:
     def missed(number: int, marker: int) -> bool:
         return number == 3 and marker == 8
