@@ -1,4 +1,4 @@
-"""The pose of a body, with its covariance, from that of what its camera sees."""
+"""Poses carried from a marker to its map and on to the body, with what they tell of each."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.compiled import compiled
+from systems.markers.pnp import normal_equations
 from systems.small_matrices import congruence, multiply
 
 Array = NDArray[np.float64]
@@ -52,3 +53,41 @@ def pose_of_body(
         G[3 + i, 3], G[3 + i, 4], G[3 + i, 5] = -a, -b, -c
         G[3 + i, 0], G[3 + i, 1], G[3 + i, 2] = b * z - c * y, c * x - a * z, a * y - b * x
     congruence(G, covariance, carried)
+
+
+@compiled(
+    "void(f8[:,:,::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[:,:,::1],"
+    " f8[:,:,::1], f8[:,::1], f8[:,:,::1])"
+)
+def poses_of_map(
+    R_CM: Array,
+    p_CM: Array,
+    R_MW: Array,
+    p_WM: Array,
+    points: Array,
+    rays: Array,
+    by_ray: Array,
+    R_CW: Array,
+    p_CW: Array,
+    product: Array,
+) -> None:
+    """Writes the poses of the map by b poses of one of its markers, and what the corners say there.
+
+    Args:
+        R_CM: (b or more, 3, 3) of the marker.
+        p_CM: (b or more, 3) m.
+        R_MW: (3, 3) of the map in the marker.
+        p_WM: (3,) of the marker in the map, m.
+        points: (m, 3) the marker's corners in W, m.
+        rays: (m, 2) of the corners.
+        by_ray: (m, 2, 2) derivative of the pixels by the rays.
+        R_CW: (b, 3, 3) written.
+        p_CW: (b, 3) written, m.
+        product: (b, 7, 7) written, [J r]'[J r] (see `normal_equations`).
+    """
+    for k in range(len(R_CW)):
+        multiply(R_CM[k], R_MW, R_CW[k])
+        for i in range(3):
+            x, y, z = R_CW[k, i]
+            p_CW[k, i] = p_CM[k, i] - (x * p_WM[0] + y * p_WM[1] + z * p_WM[2])
+        normal_equations(R_CW[k], p_CW[k], points, rays, by_ray, product[k])

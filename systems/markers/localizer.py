@@ -13,7 +13,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.cameras import PinholeCamera
 from systems.health import Counts
-from systems.markers.carried_pose import pose_of_body
+from systems.markers.carried_pose import pose_of_body, poses_of_map
 from systems.markers.corner_noise import corner_deviation
 from systems.markers.layout import MarkerMap
 from systems.markers.planar_pose import SAME_POSE, closed_form, planar_poses
@@ -181,15 +181,15 @@ class MapLocalizer:
         deviation = corner_deviation(corners, p.pixel_noise, p.pixel_noise_by_side)
         by_ray /= deviation[:, None, None, None]
         view = _View(index, self._corners[index], rays, by_ray, deviation)
-        solvable, R_CM, p_CM = closed_form(rays, self._sizes[index])
-        view = view.select(solvable)
+        if len(index) > 1:
+            solvable, R_CM, p_CM = closed_form(rays, self._sizes[index])
+            view = view.select(solvable)
         count = len(view.index)
         dropped["bad_corners"] += len(index) - count
         if count == 0:
             return nothing
         if count == 1:
-            solutions = self._single(view)
-            errors = view.errors_by_marker(solutions.R, solutions.p)
+            solutions, errors = self._single(view)
         else:
             candidates = self._candidates(R_CM, p_CM, view.index)
             solutions, errors = self._common_pose(*candidates, view)
@@ -241,14 +241,20 @@ class MapLocalizer:
         p_CW = p_CM - (R_CW @ self._p_WM[index][:, None, :, None])[..., 0]
         return R_CW.reshape(-1, 3, 3), p_CW.reshape(-1, 3)
 
-    def _single(self, view: _View) -> PnpSolution:
-        """Returns both poses by one marker: minima, or a minimum and its mirror image."""
-        poses = planar_poses(view.rays, view.by_ray, self._sizes[view.index])
-        R, p = self._candidates(poses.R, poses.p, view.index)
-        finite = np.isfinite(poses.squared_error[0])
-        return refine(
-            R[finite], p[finite], view.points[0], view.rays[0], view.by_ray[0], iterations=0
-        )
+    def _single(self, view: _View) -> tuple[PnpSolution, Array]:
+        """Returns both poses by one marker: minima, or a minimum and its mirror image.
+
+        And the errors (px) of the marker: (0 to 2, 1).
+        """
+        poses, k = planar_poses(view.rays, view.by_ray, self._sizes[view.index]), view.index[0]
+        b = np.count_nonzero(np.isfinite(poses.squared_error))
+        R, p, product = np.empty((b, 3, 3)), np.empty((b, 3)), np.empty((b, 7, 7))
+        poses_of_map(
+            poses.R[0], poses.p[0], self._R_MW[k], self._p_WM[k], view.points[0], view.rays[0],
+            view.by_ray[0], R, p, product,
+        )  # fmt: skip
+        solution = PnpSolution(R, p, product[:, 6, 6], product[:, :6, :6])
+        return solution, np.sqrt(solution.squared_error[:, None] / 4) * view.deviation
 
     def _common_pose(self, R: Array, p: Array, view: _View) -> tuple[PnpSolution, Array]:
         """Returns the best one or two minima over all markers that agree on them.

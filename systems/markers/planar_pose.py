@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from systems.compiled import compiled, in_rows
 from systems.markers.layout import marker_corners
-from systems.markers.pnp import PnpSolution, refine, rotation_from_vector
-from systems.small_matrices import solve_positive
+from systems.markers.pnp import minimise, normal_equations
+from systems.small_matrices import solve_positive, turn
 
 Array = NDArray[np.float64]
 
 SAME_POSE = 0.02  # rad; minima nearer to each other than this are one
+_ITERATIONS, _TOLERANCE = 40, 1e-8  # see `pnp.refine`
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,35 +169,47 @@ def planar_poses(rays: Array, by_ray: Array, sizes: Array) -> PlanarPoses:
         as pose; never NaN.
     """
     n = len(rays)
-    poses = PlanarPoses(
-        R=np.tile(np.eye(3), (n, 2, 1, 1)),
-        p=np.zeros((n, 2, 3)),
-        squared_error=np.full((n, 2), np.inf),
-        information=np.zeros((n, 2, 6, 6)),
-        second_is_minimum=np.zeros(n, bool),
-    )
-    good, R, p = closed_form(rays, sizes)
-    if not good.any():
-        return poses
-    points, rays, by_ray = _points(sizes[good]), rays[good], by_ray[good]
-    twice = (v.repeat(2, axis=0) for v in (points, rays, by_ray))
-    minima = refine(R.reshape(-1, 3, 3), p.reshape(-1, 3), *twice)
-    R, p, error, information = _better_first(minima)
-    merged = angle_between(R[:, 0], R[:, 1]) < SAME_POSE
-    if merged.any():
-        p_first = p[merged, 0]
-        mirror = mirrored(R[merged, 0], -p_first / np.linalg.norm(p_first, axis=1, keepdims=True))
-        seen = points[merged], rays[merged], by_ray[merged]
-        p_mirror = np.empty((len(mirror), 3))
-        for k in range(len(mirror)):
-            _translation(mirror[k], seen[0][k], seen[1][k], p_mirror[k])
-        image = refine(mirror, p_mirror, *seen, iterations=0)
-        R[merged, 1], p[merged, 1] = image.R, image.p
-        error[merged, 1], information[merged, 1] = image.squared_error, image.information
-    poses.R[good], poses.p[good] = R, p
-    poses.squared_error[good], poses.information[good] = error, information
-    poses.second_is_minimum[good] = ~merged
-    return poses
+    R, p, product = np.empty((n, 2, 3, 3)), np.empty((n, 2, 3)), np.empty((n, 2, 7, 7))
+    second_is_minimum = np.empty(n, bool)
+    _planar_poses(
+        in_rows(rays, 4, 2), in_rows(by_ray, 4, 2, 2), in_rows(_points(sizes), 4, 3),
+        R, p, product, second_is_minimum,
+    )  # fmt: skip
+    return PlanarPoses(R, p, product[..., 6, 6], product[..., :6, :6], second_is_minimum)
+
+
+@compiled(
+    "void(f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,:,:,::1],"
+    " b1[::1])"
+)
+def _planar_poses(
+    rays: Array,
+    by_ray: Array,
+    points: Array,
+    R: Array,
+    p: Array,
+    product: Array,
+    second_is_minimum: NDArray[np.bool_],
+) -> None:
+    """Writes the poses, and [J r]'[J r] (n, 2, 7, 7) there (see `pnp.normal_equations`)."""
+    for n in range(len(rays)):
+        second_is_minimum[n] = False
+        if not _two_poses(rays[n], points[n], R[n], p[n]):
+            R[n], p[n], product[n] = np.eye(3), 0.0, 0.0
+            product[n, :, 6, 6] = math.inf
+            continue
+        one = slice(n, n + 1)
+        product[n] = minimise(
+            R[n], p[n], points[one], rays[one], by_ray[one], _ITERATIONS, _TOLERANCE, math.inf
+        )
+        if product[n, 1, 6, 6] < product[n, 0, 6, 6]:
+            R[n], p[n], product[n] = R[n, ::-1].copy(), p[n, ::-1].copy(), product[n, ::-1].copy()
+        cosine = (np.sum(R[n, 0] * R[n, 1]) - 1) / 2
+        second_is_minimum[n] = math.acos(min(max(cosine, -1.0), 1.0)) >= SAME_POSE
+        if not second_is_minimum[n]:
+            _mirror(R[n, 0], -p[n, 0] / math.sqrt(np.sum(p[n, 0] ** 2)), R[n, 1])
+            _translation(R[n, 1], points[n], rays[n], p[n, 1])
+            normal_equations(R[n, 1], p[n, 1], points[n], rays[n], by_ray[n], product[n, 1])
 
 
 def closed_form(rays: Array, sizes: Array) -> tuple[NDArray[np.bool_], Array, Array]:
@@ -218,20 +231,23 @@ def closed_form(rays: Array, sizes: Array) -> tuple[NDArray[np.bool_], Array, Ar
 
 @compiled("void(f8[:,:,::1], f8[:,:,::1], b1[::1], f8[:,:,:,::1], f8[:,:,::1])")
 def _closed_form(rays: Array, points: Array, good: NDArray[np.bool_], R: Array, p: Array) -> None:
-    H = np.empty((3, 3))
     for n in range(len(rays)):
-        corners = rays[n]
-        good[n] = _faces_us(corners)
-        if not good[n]:
-            continue
-        _homography(corners, H)
-        for i in range(3):
-            for j in range(3):
-                good[n] &= math.isfinite(H[i, j])
-        if good[n]:
-            _two_rotations(H, R[n])
-            for k in range(2):
-                _translation(R[n, k], points[n], corners, p[n, k])
+        good[n] = _two_poses(rays[n], points[n], R[n], p[n])
+
+
+@compiled()
+def _two_poses(corners: Array, points: Array, R: Array, p: Array) -> bool:
+    """Writes both poses of a marker by its homography; False, with R and p spoilt, without any."""
+    H = np.empty((3, 3))
+    if not _faces_us(corners):
+        return False
+    _homography(corners, H)
+    if not np.isfinite(H).all():
+        return False
+    _two_rotations(H, R)
+    for k in range(2):
+        _translation(R[k], points, corners, p[k])
+    return True
 
 
 @compiled()
@@ -263,26 +279,30 @@ def mirrored(R: Array, sight: Array) -> Array:
         R: (n, 3, 3) of markers in any frame.
         sight: (n, 3) directions to the viewer in that frame, of length 1.
     """
-    normal = R[:, :, 0]
-    axis = np.cross(normal, sight)
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    tilt = np.arctan2(sine, (normal * sight).sum(axis=1, keepdims=True))
-    return rotation_from_vector(axis / np.maximum(sine, 1e-12) * 2 * tilt) @ R
+    image = np.empty((len(R), 3, 3))
+    _mirror_all(in_rows(R, 3, 3), in_rows(sight, 3), image)
+    return image
+
+
+@compiled("void(f8[:,:,::1], f8[:,::1], f8[:,:,::1])")
+def _mirror_all(R: Array, sight: Array, image: Array) -> None:
+    for n in range(len(R)):
+        _mirror(R[n], sight[n], image[n])
+
+
+@compiled()
+def _mirror(R: Array, sight: Array, image: Array) -> None:
+    normal, axis = R[:, 0], np.empty(3)
+    cosine = 0.0
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        axis[i] = normal[j] * sight[k] - normal[k] * sight[j]
+        cosine += normal[i] * sight[i]
+    sine = math.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
+    turn(axis * (2 * math.atan2(sine, cosine) / max(sine, 1e-12)), R, image)
 
 
 def angle_between(R1: Array, R2: Array) -> Array:
     """Returns (n,) the angle of the rotation from one to the other, rad."""
     cosine = ((R1 * R2).sum(axis=(-1, -2)) - 1) / 2
     return np.arccos(np.clip(cosine, -1, 1))
-
-
-def _better_first(solution: PnpSolution) -> tuple[Array, Array, Array, Array]:
-    error = solution.squared_error.reshape(-1, 2)
-    order = np.argsort(error, axis=1, kind="stable")
-    rows = np.arange(len(error))[:, None]
-    return (
-        solution.R.reshape(-1, 2, 3, 3)[rows, order],
-        solution.p.reshape(-1, 2, 3)[rows, order],
-        error[rows, order],
-        solution.information.reshape(-1, 2, 6, 6)[rows, order],
-    )

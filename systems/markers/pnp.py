@@ -146,7 +146,7 @@ def _keep_before_camera(p_C: Array) -> NDArray[np.bool_]:
 
 
 @compiled()
-def _normal_equations(
+def normal_equations(
     R: Array, p: Array, points: Array, rays: Array, by_ray: Array, product: Array
 ) -> None:
     """Writes [J r]'[J r], (7, 7), of one problem: J'J, J'r and the squared error r'r.
@@ -187,7 +187,7 @@ def _normal_equations(
 @compiled(
     "f8[:,:,::1](f8[:,:,::1], f8[:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,:,::1], i8, f8, f8)"
 )
-def _minimise(
+def minimise(
     R: Array,
     p: Array,
     points: Array,
@@ -202,7 +202,7 @@ def _minimise(
     product, trial = np.empty((b, 7, 7)), np.empty((7, 7))
     for i in range(b):
         k = 0 if shared else i
-        _normal_equations(R[i], p[i], points[k], rays[k], by_ray[k], product[i])
+        normal_equations(R[i], p[i], points[k], rays[k], by_ray[k], product[i])
     damping = np.full(b, _DAMPING_START)
     active = np.isfinite(product[:, 6, 6])
     damped, step = np.empty((6, 6)), np.empty(6)
@@ -228,7 +228,7 @@ def _minimise(
                 continue
             turn(step, R[i], R_new)
             p_new[:] = p[i] + step[3:]
-            _normal_equations(R_new, p_new, points[k], rays[k], by_ray[k], trial)
+            normal_equations(R_new, p_new, points[k], rays[k], by_ray[k], trial)
             if trial[6, 6] <= here[6, 6]:
                 R[i], p[i], product[i] = R_new, p_new, trial
                 damping[i] *= 0.1
@@ -275,7 +275,7 @@ def refine(
     m = points.shape[-2]
     R, p = np.array(R, order="C"), np.array(p, order="C")
     points, rays = in_rows(points, m, 3), in_rows(rays, m, 2)
-    product = _minimise(
+    product = minimise(
         R, p, points, rays, in_rows(by_ray, m, 2, 2), iterations, tolerance, hopeless
     )
     return PnpSolution(R, p, product[:, 6, 6], product[:, :6, :6])
