@@ -169,47 +169,65 @@ def planar_poses(rays: Array, by_ray: Array, sizes: Array) -> PlanarPoses:
         as pose; never NaN.
     """
     n = len(rays)
-    R, p, product = np.empty((n, 2, 3, 3)), np.empty((n, 2, 3)), np.empty((n, 2, 7, 7))
+    seen = in_rows(_points(sizes), 4, 3), in_rows(rays, 4, 2), in_rows(by_ray, 4, 2, 2)
+    good, R, p = np.empty(n, bool), np.empty((n, 2, 3, 3)), np.empty((n, 2, 3))
+    _closed_forms(*seen[:2], good, R, p)
+    product = minimise(
+        R.reshape(-1, 3, 3), p.reshape(-1, 3), *seen, _ITERATIONS, _TOLERANCE, math.inf
+    ).reshape(n, 2, 7, 7)
     second_is_minimum = np.empty(n, bool)
-    _planar_poses(
-        in_rows(rays, 4, 2), in_rows(by_ray, 4, 2, 2), in_rows(_points(sizes), 4, 3),
-        R, p, product, second_is_minimum,
-    )  # fmt: skip
-    return PlanarPoses(R, p, product[..., 6, 6], product[..., :6, :6], second_is_minimum)
+    _settle(R, p, product, *seen, second_is_minimum)
+    return PlanarPoses(R, p, product[..., 6, 6], product[..., :6, :6], good & second_is_minimum)
 
 
 @compiled(
-    "void(f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,:,:,::1],"
+    "void(f8[:,:,:,::1], f8[:,:,::1], f8[:,:,:,::1], f8[:,:,::1], f8[:,:,::1], f8[:,:,:,::1],"
     " b1[::1])"
 )
-def _planar_poses(
-    rays: Array,
-    by_ray: Array,
-    points: Array,
+def _settle(
     R: Array,
     p: Array,
     product: Array,
+    points: Array,
+    rays: Array,
+    by_ray: Array,
     second_is_minimum: NDArray[np.bool_],
 ) -> None:
-    """Writes the poses, and [J r]'[J r] (n, 2, 7, 7) there (see `pnp.normal_equations`)."""
-    for n in range(len(rays)):
-        second_is_minimum[n] = False
-        if not _two_poses(rays[n], points[n], R[n], p[n]):
-            R[n], p[n], product[n] = np.eye(3), 0.0, 0.0
-            product[n, :, 6, 6] = math.inf
-            continue
-        one = slice(n, n + 1)
-        product[n] = minimise(
-            R[n], p[n], points[one], rays[one], by_ray[one], _ITERATIONS, _TOLERANCE, math.inf
-        )
+    """Puts the better pose first, and its mirror image second where both are one minimum.
+
+    Args:
+        R: (n, 2, 3, 3), changed.
+        p: (n, 2, 3), changed.
+        product: (n, 2, 7, 7) as `minimise` returns it, changed.
+        points: (n, 4, 3).
+        rays: (n, 4, 2).
+        by_ray: (n, 4, 2, 2).
+        second_is_minimum: (n,) written.
+    """
+    sight = np.empty(3)
+    for n in range(len(R)):
         if product[n, 1, 6, 6] < product[n, 0, 6, 6]:
-            R[n], p[n], product[n] = R[n, ::-1].copy(), p[n, ::-1].copy(), product[n, ::-1].copy()
-        cosine = (np.sum(R[n, 0] * R[n, 1]) - 1) / 2
+            for i in range(7):
+                for j in range(7):
+                    a, b = product[n, 0, i, j], product[n, 1, i, j]
+                    product[n, 0, i, j], product[n, 1, i, j] = b, a
+            for i in range(3):
+                p[n, 0, i], p[n, 1, i] = p[n, 1, i], p[n, 0, i]
+                for j in range(3):
+                    R[n, 0, i, j], R[n, 1, i, j] = R[n, 1, i, j], R[n, 0, i, j]
+        cosine, square = -0.5, 0.0
+        for i in range(3):
+            square += p[n, 0, i] * p[n, 0, i]
+            for j in range(3):
+                cosine += R[n, 0, i, j] * R[n, 1, i, j] / 2
         second_is_minimum[n] = math.acos(min(max(cosine, -1.0), 1.0)) >= SAME_POSE
-        if not second_is_minimum[n]:
-            _mirror(R[n, 0], -p[n, 0] / math.sqrt(np.sum(p[n, 0] ** 2)), R[n, 1])
-            _translation(R[n, 1], points[n], rays[n], p[n, 1])
-            normal_equations(R[n, 1], p[n, 1], points[n], rays[n], by_ray[n], product[n, 1])
+        if second_is_minimum[n] or math.isinf(product[n, 0, 6, 6]):
+            continue
+        for i in range(3):
+            sight[i] = -p[n, 0, i] / math.sqrt(square)
+        _mirror(R[n, 0], sight, R[n, 1])
+        _translation(R[n, 1], points[n], rays[n], p[n, 1])
+        normal_equations(R[n, 1], p[n, 1], points[n], rays[n], by_ray[n], product[n, 1])
 
 
 def closed_form(rays: Array, sizes: Array) -> tuple[NDArray[np.bool_], Array, Array]:
@@ -225,25 +243,31 @@ def closed_form(rays: Array, sizes: Array) -> tuple[NDArray[np.bool_], Array, Ar
     """
     n = len(rays)
     good, R, p = np.empty(n, bool), np.empty((n, 2, 3, 3)), np.empty((n, 2, 3))
-    _closed_form(in_rows(rays, 4, 2), in_rows(_points(sizes), 4, 3), good, R, p)
+    _closed_forms(in_rows(_points(sizes), 4, 3), in_rows(rays, 4, 2), good, R, p)
     return (good, R, p) if good.all() else (good, R[good], p[good])
 
 
 @compiled("void(f8[:,:,::1], f8[:,:,::1], b1[::1], f8[:,:,:,::1], f8[:,:,::1])")
-def _closed_form(rays: Array, points: Array, good: NDArray[np.bool_], R: Array, p: Array) -> None:
+def _closed_forms(points: Array, rays: Array, good: NDArray[np.bool_], R: Array, p: Array) -> None:
+    """Writes which markers have poses, and those; the identity for the others."""
     for n in range(len(rays)):
-        good[n] = _two_poses(rays[n], points[n], R[n], p[n])
+        good[n] = _two_poses(points[n], rays[n], R[n], p[n])
+        if not good[n]:
+            R[n], p[n] = 0.0, 0.0
+            R[n, :, 0, 0], R[n, :, 1, 1], R[n, :, 2, 2] = 1.0, 1.0, 1.0
 
 
 @compiled()
-def _two_poses(corners: Array, points: Array, R: Array, p: Array) -> bool:
+def _two_poses(points: Array, corners: Array, R: Array, p: Array) -> bool:
     """Writes both poses of a marker by its homography; False, with R and p spoilt, without any."""
     H = np.empty((3, 3))
     if not _faces_us(corners):
         return False
     _homography(corners, H)
-    if not np.isfinite(H).all():
-        return False
+    for i in range(3):
+        for j in range(3):
+            if not math.isfinite(H[i, j]):
+                return False
     _two_rotations(H, R)
     for k in range(2):
         _translation(R[k], points, corners, p[k])
@@ -292,14 +316,16 @@ def _mirror_all(R: Array, sight: Array, image: Array) -> None:
 
 @compiled()
 def _mirror(R: Array, sight: Array, image: Array) -> None:
-    normal, axis = R[:, 0], np.empty(3)
-    cosine = 0.0
+    w, square, cosine = np.empty(3), 0.0, 0.0
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        axis[i] = normal[j] * sight[k] - normal[k] * sight[j]
-        cosine += normal[i] * sight[i]
-    sine = math.sqrt(axis[0] * axis[0] + axis[1] * axis[1] + axis[2] * axis[2])
-    turn(axis * (2 * math.atan2(sine, cosine) / max(sine, 1e-12)), R, image)
+        w[i] = R[j, 0] * sight[k] - R[k, 0] * sight[j]
+        square += w[i] * w[i]
+        cosine += R[i, 0] * sight[i]
+    sine = math.sqrt(square)
+    for i in range(3):
+        w[i] *= 2 * math.atan2(sine, cosine) / max(sine, 1e-12)
+    turn(w, R, image)
 
 
 def angle_between(R1: Array, R2: Array) -> Array:

@@ -198,10 +198,10 @@ def minimise(
     hopeless: float,
 ) -> Array:
     """Moves R and p to the minima (see `refine`); returns [J r]'[J r] there, (b, 7, 7)."""
-    b, shared = len(R), len(points) == 1
+    b = len(R)
     product, trial = np.empty((b, 7, 7)), np.empty((7, 7))
     for i in range(b):
-        k = 0 if shared else i
+        k = i * len(points) // b
         normal_equations(R[i], p[i], points[k], rays[k], by_ray[k], product[i])
     damping = np.full(b, _DAMPING_START)
     active = np.isfinite(product[:, 6, 6])
@@ -213,7 +213,7 @@ def minimise(
         for i in range(b):
             if not active[i]:
                 continue
-            k, here = 0 if shared else i, product[i]
+            k, here = i * len(points) // b, product[i]
             damped[:] = here[:6, :6]
             for m in range(6):
                 damped[m, m] *= 1 + damping[i]
@@ -258,9 +258,9 @@ def refine(
     Args:
         R: (b, 3, 3) `R_CF` to start from.
         p: (b, 3) `p_CF` to start from, m.
-        points: (b, m, 3) or (m, 3), in F, m.
-        rays: (b, m, 2) or (m, 2), measured.
-        by_ray: (b, m, 2, 2) or (m, 2, 2) derivative of the pixels by the rays, px.
+        points: (b, m, 3), in F, m; or (m, 3) for all, or (b / s, m, 3), each for s starts in turn.
+        rays: (b, m, 2) likewise, measured.
+        by_ray: (b, m, 2, 2) likewise, derivative of the pixels by the rays, px.
         iterations: at most so many steps; four or five do, unless the start lies on a saddle, as a
             marker's second pose does where there is but one minimum.
         tolerance: a problem is done when a step promises to lower its error by less than this part
