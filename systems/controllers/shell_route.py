@@ -228,20 +228,23 @@ class ShellRoute(LeafSystem):
         """Returns the port of the leg and the angle along it."""
         return self._progress_output
 
-    def _where(self, context: Context) -> tuple[int, OnLeg, float]:
-        """Returns leg, place and the angle driven along it, which may exceed half a turn."""
-        index, driven = context.get_discrete_state(self._progress).get_value()
+    def _where(self, context: Context) -> tuple[int, OnLeg, float] | None:
+        """Returns leg, place and the angle driven along it, which may exceed half a turn.
+
+        None at the end of the route.
+        """
+        index, driven = context.get_discrete_state(self._progress).get_value().tolist()
+        if index >= len(self._legs):
+            return None
         R_RB = self._pose_input.Eval(context).rotation().matrix()
         where = on_leg(R_RB, self._frames[int(index)])
-        return int(index), where, float(driven + wrap(where.along - driven))
-
-    def _done(self, context: Context) -> bool:
-        return bool(context.get_discrete_state(self._progress)[0] >= len(self._legs))
+        return int(index), where, driven + wrap(where.along - driven)
 
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
-        if self._done(context):
+        now = self._where(context)
+        if now is None:
             return
-        index, where, driven = self._where(context)
+        index, where, driven = now
         arc = self._legs[index].arc
         if arc > 0:
             reached = (arc - driven) * self._radius <= self._parameters.position_tolerance
@@ -250,10 +253,11 @@ class ShellRoute(LeafSystem):
         discrete_state.set_value(self._progress, [index + 1, 0.0] if reached else [index, driven])
 
     def _calc_command(self, context: Context, output: Any) -> None:
-        if self._done(context):
+        now = self._where(context)
+        if now is None:
             output.SetFromVector([0.0, 0.0])
             return
-        index, where, driven = self._where(context)
+        index, where, driven = now
         leg = self._legs[index]
         if leg.arc == 0:
             where = where._replace(left=0.0)

@@ -120,8 +120,15 @@ class SphereFlowEstimator:
         self.view = view
         self.parameters = parameters or SphereFlowParameters()
         self.body_frame = body_frame
-        X_SC = view.X_SC
-        self._X_SC = packed(X_SC.rotation().matrix()), packed(X_SC.translation())
+        self._nothing = RotationIncrement(frame_id=body_frame)
+        X_SC, camera = view.X_SC, view.camera
+        self._place = *camera.matrices, packed(X_SC.rotation().matrix()), packed(X_SC.translation())
+        # On the shell, a pixel is this long in the middle of the picture. The limit is doubled as
+        # two points give a rough rotation.
+        focal = min(camera.K[0, 0], camera.K[1, 1])
+        limit = 2 * self.parameters.inlier_px * view.parameters.camera_height / focal
+        # |R a - b|^2 = 2 (r^2 - b'R a).
+        self._least = float(view.radius**2 - limit**2 / 2)
 
     def fit(self, matches: PointMatches) -> SphereFit:
         """Fits one rotation to the matches of two pictures.
@@ -130,32 +137,31 @@ class SphereFlowEstimator:
         """
         p = self.parameters
         dropped = dict.fromkeys(REASONS, 0)
-        nothing = RotationIncrement(frame_id=self.body_frame)
         shapes = matches.previous.shape == matches.current.shape == (len(matches), 2)
         interval = matches.stamp - matches.previous_stamp
         if not (shapes and math.isfinite(interval) and interval > 0):
             dropped["bad_matches"] = int(not math.isnan(matches.stamp))
-            return SphereFit(nothing, dropped)
+            return SphereFit(self._nothing, dropped)
         before, after, pixels = self.view.matched(matches.previous, matches.current)
         dropped["bad_point"] = len(matches) - len(pixels)
         if len(before) < p.min_inliers:
             dropped["few_points"] = 1
-            return SphereFit(nothing, dropped)
+            return SphereFit(self._nothing, dropped)
         inliers, R_B2B1 = self._consensus(before, after, matches.stamp)
         enough = max(float(p.min_inliers), p.min_inlier_share * len(before))
-        if np.count_nonzero(inliers) < enough:
+        agreed = np.count_nonzero(inliers)
+        if agreed < enough:
             dropped["no_agreement"] = 1
-            return SphereFit(nothing, dropped)
-        if not inliers.all():
+            return SphereFit(self._nothing, dropped)
+        if agreed < len(before):
             R_B2B1 = nearest_turn(before[inliers], after[inliers])
         inverse = np.empty((3, 3))
         count, squares = refine_turn(
-            before, pixels, *self.view.camera.matrices, *self._X_SC,
-            p.inlier_px, enough, R_B2B1, inverse,
+            before, pixels, *self._place, p.inlier_px, enough, R_B2B1, inverse
         )  # fmt: skip
         if count == 0:
             dropped["no_agreement"] = 1
-            return SphereFit(nothing, dropped)
+            return SphereFit(self._nothing, dropped)
         variance = max(p.pixel_noise**2, squares / (2 * count - 3))
         increment = RotationIncrement(
             stamp=matches.stamp,
@@ -176,12 +182,7 @@ class SphereFlowEstimator:
         That of all points, if nearly all agree with it; else the best of those of random pairs.
         """
         p, view = self.parameters, self.view
-        # On the shell, a pixel is this long in the middle of the picture. The limit is doubled as
-        # two points give a rough rotation.
-        focal = min(view.camera.K[0, 0], view.camera.K[1, 1])
-        limit = 2 * p.inlier_px * view.parameters.camera_height / focal
-        # |R a - b|^2 = 2 (r^2 - b'R a).
-        least = view.radius**2 - limit**2 / 2
+        least = self._least
         R_all = nearest_turn(before, after)
         together = np.empty(len(before), bool)
         if agreeing(before, after, R_all, least, together) >= _NEARLY_ALL * len(before):

@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.markers.layout import MarkerMap
 from systems.messages import Detections
 from systems.validation import require_positive
-
-Array = NDArray[np.float64]
 
 
 class MarkersSeen(LeafSystem):
@@ -46,11 +42,11 @@ class MarkersSeen(LeafSystem):
         super().__init__()
         require_positive(rate=rate, enough=enough)
         self._enough = enough
-        self._ids = np.array(sorted(marker_map.markers))
+        self._index = {marker: k for k, marker in enumerate(sorted(marker_map.markers))}
         self._detections_input = self.DeclareAbstractInputPort(
             "detections", AbstractValue.Make(Detections())
         )
-        self._met = self.DeclareDiscreteState(len(self._ids))
+        self._met = self.DeclareDiscreteState(len(self._index))
         # Whether enough are in view, how many were met, share; then stamp, pictures, with enough.
         self._seen = self.DeclareDiscreteState([0.0, 0.0, 0.0])
         self._pictures = self.DeclareDiscreteState([math.nan, 0.0, 0.0])
@@ -67,13 +63,17 @@ class MarkersSeen(LeafSystem):
 
     def _look(self, context: Context, discrete_state: DiscreteValues) -> None:
         detections: Detections = self._detections_input.Eval(context)
-        stamp, pictures, shown = context.get_discrete_state(self._pictures).get_value()
+        stamp, pictures, shown = context.get_discrete_state(self._pictures).get_value().tolist()
         if math.isnan(detections.stamp) or detections.stamp == stamp:
             return
-        known = (self._ids[:, None] == detections.ids).any(axis=1)
-        met = np.maximum(context.get_discrete_state(self._met).get_value(), known)
-        enough = known.sum() >= self._enough
+        known = [self._index[i] for i in {*detections.ids.tolist()} if i in self._index]
+        enough = len(known) >= self._enough
         pictures, shown = pictures + 1, shown + enough
-        discrete_state.set_value(self._met, met)
+        number = context.get_discrete_state(self._seen)[1]
+        if known:
+            met = context.get_discrete_state(self._met).get_value().copy()
+            met[known] = 1.0
+            number = met.sum()
+            discrete_state.set_value(self._met, met)
         discrete_state.set_value(self._pictures, [detections.stamp, pictures, shown])
-        discrete_state.set_value(self._seen, [float(enough), met.sum(), shown / pictures])
+        discrete_state.set_value(self._seen, [float(enough), number, shown / pictures])
