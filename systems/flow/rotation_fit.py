@@ -29,13 +29,18 @@ def nearest_turn(before: Array, after: Array) -> Array:
     DOAOP", 1977.
     """
     R = np.empty((3, 3))
-    _by_quaternion(packed(after.T @ before), R)
+    _nearest_turn(packed(before), packed(after), R)
     return R
 
 
-@compiled("void(f8[:,::1], f8[:,::1])")
-def _by_quaternion(B: Array, R: Array) -> None:
+@compiled("void(f8[:,::1], f8[:,::1], f8[:,::1])")
+def _nearest_turn(before: Array, after: Array, R: Array) -> None:
     """Writes the rotation with the largest trace of R' B: its quaternion is an eigenvector."""
+    B = np.zeros((3, 3))
+    for k in range(len(before)):
+        for i in range(3):
+            for j in range(3):
+                B[i, j] += after[k, i] * before[k, j]
     K, values, vectors = np.empty((4, 4)), np.empty(4), np.empty((4, 4))
     trace = B[0, 0] + B[1, 1] + B[2, 2]
     K[0, 0] = trace
@@ -53,11 +58,20 @@ def _by_quaternion(B: Array, R: Array) -> None:
     rotation_of_quaternion(vectors[:, best], R)
 
 
-@compiled("i8(f8[:,::1], f8[:,::1], f8[:,::1], f8, b1[::1])")
-def agreeing(
-    before: Array, after: Array, R: Array, least: float, together: NDArray[np.bool_]
+@compiled("i8(f8[:,::1], f8[:,::1], f8, f8[:,::1], b1[::1])")
+def common_turn(
+    before: Array, after: Array, least: float, R: Array, together: NDArray[np.bool_]
 ) -> int:
-    """Writes which points (n, 3) have a product b'R a beyond `least`; returns how many."""
+    """Writes the nearest turn of all points and which agree with it; returns how many do.
+
+    Args:
+        before: (n, 3).
+        after: (n, 3).
+        least: of points b and a that agree, the product b'R a is greater.
+        R: (3, 3), written.
+        together: (n,), written.
+    """
+    _nearest_turn(before, after, R)
     count = 0
     for k in range(len(before)):
         product = 0.0

@@ -17,7 +17,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.compiled import packed
-from systems.flow.rotation_fit import agreeing, nearest_turn, refine_turn
+from systems.flow.rotation_fit import common_turn, nearest_turn, refine_turn
 from systems.flow.shell import ShellView
 from systems.health import Counts
 from systems.memo import Memo
@@ -181,13 +181,10 @@ class SphereFlowEstimator:
 
         That of all points, if nearly all agree with it; else the best of those of random pairs.
         """
-        p, view = self.parameters, self.view
-        least = self._least
-        R_all = nearest_turn(before, after)
-        together = np.empty(len(before), bool)
-        if agreeing(before, after, R_all, least, together) >= _NEARLY_ALL * len(before):
+        p, view, n = self.parameters, self.view, len(before)
+        R_all, together = np.empty((3, 3)), np.empty(n, bool)
+        if common_turn(before, after, self._least, R_all, together) >= _NEARLY_ALL * n:
             return together, R_all
-        n = len(before)
         random = generator(_STREAM, round(abs(stamp) * 1e9))
         first = random.integers(0, n, p.hypotheses)
         second = (first + random.integers(1, n, p.hypotheses)) % n
@@ -195,7 +192,7 @@ class SphereFlowEstimator:
         R = pair_rotations(before[pairs] / view.radius, after[pairs] / view.radius)
         # All b'R a are one product of matrices.
         products = (after[:, :, None] * before[:, None, :]).reshape(n, 9)
-        agree = products @ R.reshape(-1, 9).T > least
+        agree = products @ R.reshape(-1, 9).T > self._least
         best = np.argmax(agree.sum(axis=0))
         return agree[:, best], R[best]
 

@@ -160,8 +160,9 @@ def relocate(scene: Scene, sightings: Sightings, frames: Indices, limit: float) 
 def _refined(R: Array, p: Array, seen: Sightings) -> tuple[Poses, Array]:
     """Returns both poses of each sighting after two steps, and how far each is to be trusted."""
     points = marker_corners(1.0) * seen.sizes[seen.tag][:, None, None]
-    twice = (v.repeat(2, axis=0) for v in (points, seen.rays, seen.by_ray))
-    found = refine(R.reshape(-1, 3, 3), p.reshape(-1, 3), *twice, iterations=_STEPS)
+    found = refine(
+        R.reshape(-1, 3, 3), p.reshape(-1, 3), points, seen.rays, seen.by_ray, iterations=_STEPS
+    )
     error = found.squared_error.reshape(-1, 2)
     worse = error - error.min(axis=1, keepdims=True)
     poses = Poses(found.R.reshape(-1, 2, 3, 3), found.p.reshape(-1, 2, 3))

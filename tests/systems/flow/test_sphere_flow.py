@@ -11,7 +11,7 @@ from pydrake.systems.analysis import Simulator
 from systems.cameras import PinholeCamera
 from systems.flow.lucas_kanade import LucasKanadeParameters, corners, track
 from systems.flow.mean_flow import surface_velocity
-from systems.flow.rotation_fit import nearest_turn
+from systems.flow.rotation_fit import common_turn, nearest_turn
 from systems.flow.shell import ShellView, ShellViewParameters
 from systems.flow.sphere_flow import (
     SphereFlow,
@@ -63,6 +63,18 @@ def test_the_nearest_turn_is_the_rotation_and_never_a_reflection() -> None:
     flat = p * [1, 1, 1e-9]  # on a plane a mirror would fit as well
     np.testing.assert_allclose(nearest_turn(flat, flat @ R.T), R, atol=1e-6)
     assert np.linalg.det(nearest_turn(p, -p)) == pytest.approx(1.0)
+
+
+def test_which_points_agree_with_the_turn_of_all() -> None:
+    rng = np.random.default_rng(8)
+    before = rng.standard_normal((40, 3))
+    before /= np.linalg.norm(before, axis=1, keepdims=True)
+    after = before @ rotation(np.array([0.1, 0.2, -0.3])).matrix().T
+    after[[3, 17]] = after[[17, 3]]
+    turn, together = np.empty((3, 3)), np.empty(40, bool)
+    assert common_turn(before, after, 0.95, turn, together) == 38
+    assert np.flatnonzero(~together).tolist() == [3, 17]
+    np.testing.assert_array_equal(turn, nearest_turn(before, after))
 
 
 def test_a_pair_gives_its_rotation() -> None:

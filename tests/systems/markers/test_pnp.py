@@ -138,6 +138,17 @@ def test_problems_do_not_influence_each_other() -> None:
     assert np.isinf(squared_errors(R0, p0, points, rays, by_ray)[3])
 
 
+def test_each_of_several_views_serves_as_many_starts() -> None:
+    R, p, points, pixels = random_problems(5, noise=0.5)
+    starts = perturbed(R.repeat(3, axis=0), p.repeat(3, axis=0))
+    seen = points, *STRAIGHT.rays(pixels)
+    shared = refine(*starts, *seen)
+    alone = refine(*starts, *(v.repeat(3, axis=0) for v in seen))
+    np.testing.assert_array_equal(shared.R, alone.R)
+    np.testing.assert_array_equal(shared.squared_error, alone.squared_error)
+    np.testing.assert_allclose(shared.R, R.repeat(3, axis=0), atol=0.05)
+
+
 def test_one_view_serves_many_starts() -> None:
     R, p, points, pixels = random_problems(1, noise=0.5)
     starts = perturbed(np.tile(R, (6, 1, 1)), np.tile(p, (6, 1)))
