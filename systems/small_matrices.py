@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.compiled import compiled
+from systems.compiled import compiled, packed
 
 Array = NDArray[np.float64]
 
@@ -118,6 +118,67 @@ def rotation_of(w: Array, R: Array) -> None:
     R[0, 0], R[0, 1], R[0, 2] = c + b * x * x, b * x * y - a * z, b * x * z + a * y
     R[1, 0], R[1, 1], R[1, 2] = b * x * y + a * z, c + b * y * y, b * y * z - a * x
     R[2, 0], R[2, 1], R[2, 2] = b * x * z - a * y, b * y * z + a * x, c + b * z * z
+
+
+@compiled("void(f8[:,::1], f8[::1])")
+def rotation_vector_of(R: Array, w: Array) -> None:
+    """Writes the rotation vector (3,) rad, of length 0 to pi, of a rotation R (3, 3).
+
+    Through the quaternion's outer product with itself, whose largest row is well conditioned at
+    every angle, half a turn included.
+    """
+    a, b, c = R[0, 0], R[1, 1], R[2, 2]
+    x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    xy, xz, yz = R[0, 1] + R[1, 0], R[0, 2] + R[2, 0], R[1, 2] + R[2, 1]
+    largest = max(a + b + c, a - b - c, b - a - c, c - a - b)
+    if largest == a + b + c:
+        q = (1 + a + b + c, x, y, z)
+    elif largest == a - b - c:
+        q = (x, 1 + a - b - c, xy, xz)
+    elif largest == b - a - c:
+        q = (y, xy, 1 - a + b - c, yz)
+    else:
+        q = (z, xz, yz, 1 - a - b + c)
+    sine = math.sqrt(q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    scale = 2 * math.atan2(sine, abs(q[0])) / sine if sine > 0 else 0.0
+    if q[0] < 0:
+        scale = -scale
+    for i in range(3):
+        w[i] = scale * q[1 + i]
+
+
+def folded(P: Array) -> Array:
+    """Returns the lower half of a symmetric P (n, n), row by row: n (n + 1) / 2 numbers."""
+    lower = np.empty(len(P) * (len(P) + 1) // 2)
+    fold(packed(P), lower)
+    return lower
+
+
+def unfolded(lower: Array, n: int) -> Array:
+    """Returns the first n rows and columns of what has been `folded`."""
+    P = np.empty((n, n))
+    unfold(packed(lower), P)
+    return P
+
+
+@compiled("void(f8[:,::1], f8[::1])")
+def fold(P: Array, lower: Array) -> None:
+    """Writes what `folded` returns; for compiled code too."""
+    k = 0
+    for i in range(len(P)):
+        for j in range(i + 1):
+            lower[k] = P[i, j]
+            k += 1
+
+
+@compiled("void(f8[::1], f8[:,::1])")
+def unfold(lower: Array, P: Array) -> None:
+    """Writes what `unfolded` returns; for compiled code too."""
+    k = 0
+    for i in range(len(P)):
+        for j in range(i + 1):
+            P[i, j] = P[j, i] = lower[k]
+            k += 1
 
 
 @compiled()

@@ -73,7 +73,7 @@ class RateTrail:
             newest: number of the last sample, if it is known.
         """
         told = np.empty(13)
-        _turn(
+        turn_between(
             packed(self._rows),
             start,
             end,
@@ -104,7 +104,7 @@ def add_row(rows: Array, k: int, gyro: Array, reference: Array, lost: bool, rate
 
 
 @compiled("void(f8[:,::1], f8, f8, f8, f8, i8, f8[::1])")
-def _turn(
+def turn_between(
     rows: Array, start: float, end: float, age: float, rate: float, newest: int, told: Array
 ) -> None:
     """Writes the integrals (6,), the rates at both ends (3,) and the time without a gyro."""

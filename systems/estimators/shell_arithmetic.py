@@ -1,4 +1,4 @@
-"""The arithmetic of `shell_model`, compiled: one call a step or a measurement.
+"""The motion of `shell_model`, compiled: one call a step. Measurements are in `shell_correction`.
 
 What the symbols mean is said there. Turns of an interval come as their parts: the integrals of gyro
 and reference, the length, the rates at both ends, and the way that the flow tells (of size 0 for
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from systems.compiled import compiled
-from systems.small_matrices import congruence, multiply, rotation_of, solve_positive
+from systems.small_matrices import congruence, multiply, rotation_of
 
 Array = NDArray[np.float64]
 
@@ -22,9 +22,7 @@ THETA, BIAS, MOUNTING, SCALE, DELAY, ROCK, GYRO, STEP, SIZE = 0, 3, 6, 9, 11, 12
 _NOISES = 8  # of the step (3), of the rock (2), of the bias (3)
 
 
-@compiled(
-    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1])",
-)
+@compiled()
 def turned(
     R: Array,
     x: Array,
@@ -57,10 +55,7 @@ def turned(
             u[i] += x[GYRO + 3 * i + j] * factor[j]
 
 
-@compiled(
-    "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8[::1], f8[::1], f8[::1], f8[:,::1], f8,"
-    " f8[::1], f8[:,::1], f8[:,::1])",
-)
+@compiled()
 def transition(
     R: Array,
     x: Array,
@@ -156,7 +151,7 @@ def _differentiate_step(
                 J[i, BIAS + j] -= dt * x[GYRO + 3 * i + j]
 
 
-@compiled("void(f8[:,::1], f8[::1], f8[::1], f8, f8[:,::1], f8[::1], f8[::1])")
+@compiled()
 def carry(
     R: Array, x: Array, u: Array, fading: float, moved: Array, after: Array, change: Array
 ) -> None:
@@ -181,7 +176,7 @@ def carry(
         after[ROCK + k] += change[k]
 
 
-@compiled("void(f8[:,::1], f8[::1], f8, f8[::1])")
+@compiled()
 def stand(R: Array, x: Array, reach: float, p: Array) -> None:
     """Writes where the body's origin is (3,) m: `reach` (m) up the normal that it rocks about."""
     a, b = -x[ROCK + 1], x[ROCK]
@@ -190,14 +185,73 @@ def stand(R: Array, x: Array, reach: float, p: Array) -> None:
         p[i] = far * (R[i, 0] * a + R[i, 1] * b + R[i, 2])
 
 
-@compiled("void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8, f8, f8, f8[:,::1], f8[::1])")
+@compiled(
+    "void(f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1], f8, f8[::1], f8[::1], f8, f8[::1],"
+    " f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8[::1])",
+)
+def predict(
+    R: Array,
+    x: Array,
+    P: Array,
+    gyro: Array,
+    reference: Array,
+    dt: float,
+    rate_before: Array,
+    rate_after: Array,
+    lost: float,
+    way: Array,
+    noise: Array,
+    rock_step: Array,
+    moved: Array,
+    after: Array,
+    grown: Array,
+    u: Array,
+    seen: Array,
+) -> None:
+    """Writes the state at the end of an interval, as `ShellModel.predict` gives it.
+
+    Args:
+        R: (3, 3), as the others up to `rock_step` see `transition` and `Turn`.
+        x: (n,).
+        P: (n, n).
+        gyro: (3,).
+        reference: (3,).
+        dt: s.
+        rate_before: (3,).
+        rate_after: (3,).
+        lost: s.
+        way: (3,) or of size 0.
+        noise: (5,) see `ProcessNoise`.
+        rock_step: (3, 2).
+        moved: (3, 3), written: R after it.
+        after: (n,), written: x.
+        grown: (n, n), written: P.
+        u: (3,), written: the step.
+        seen: (3,), written: what the flow is to see of it.
+    """
+    rock_time = noise[4]
+    F, G, Q, change = np.empty((SIZE, SIZE)), np.empty((SIZE, 8)), np.empty(_NOISES), np.empty(2)
+    transition(
+        R, x, gyro, reference, dt, rate_before, rate_after, way, rock_step, rock_time, u, F, G
+    )
+    Q[:3] = noise[0] * dt + noise[1] * lost
+    Q[3:5] = -noise[3] * math.expm1(-2 * dt / rock_time)
+    Q[5:] = noise[2] * dt
+    grown[:] = P
+    propagate(grown, F, G, Q)  # the markers stay where they are
+    carry(R, x, u, math.expm1(-dt / rock_time), moved, after, change)
+    for i in range(3):
+        seen[i] = u[i] + rock_step[i, 0] * change[0] + rock_step[i, 1] * change[1]
+
+
+@compiled()
 def pose_after(
     R: Array,
     x: Array,
     gyro: Array,
     reference: Array,
     dt: float,
-    fading: float,
+    rock_time: float,
     reach: float,
     moved: Array,
     p: Array,
@@ -205,23 +259,23 @@ def pose_after(
     """Writes rotation (3, 3) and place (3,) m at the end of an interval; see `turned`, `carry`."""
     u, factor, change, after = np.empty(3), np.empty(3), np.empty(2), np.empty(SIZE)
     turned(R, x, gyro, reference, dt, np.empty(0), u, factor)
-    carry(R, x[:SIZE], u, fading, moved, after, change)
+    carry(R, x[:SIZE], u, math.expm1(-dt / rock_time), moved, after, change)
     stand(moved, after, reach, p)
 
 
-@compiled("void(f8[:,::1], f8[::1], f8[:,::1], f8, f8[:,::1])")
+@compiled()
 def pose_covariance(R: Array, x: Array, P: Array, reach: float, covariance: Array) -> None:
     """Writes the covariance (6, 6) of rotation and place, of P (SIZE, SIZE); see `stand`."""
     p, H = np.empty(3), np.zeros((6, SIZE))
     stand(R, x, reach, p)
-    _add_cross(p, -1.0, H[3:], THETA)
+    add_cross(p, -1.0, H[3:], THETA)
     for i in range(3):
         H[i, THETA + i] = 1.0
         H[3 + i, ROCK], H[3 + i, ROCK + 1] = reach * R[i, 1], -reach * R[i, 0]
     congruence(H, P, covariance)
 
 
-@compiled("void(f8[:,::1], f8[:,::1], f8[:,::1], f8[::1])")
+@compiled()
 def propagate(P: Array, F: Array, G: Array, Q: Array) -> None:
     """Changes P (n, n) to F P F' + G Q G'; beyond the first SIZE states F is 1 and G is 0.
 
@@ -275,145 +329,6 @@ def propagate(P: Array, F: Array, G: Array, Q: Array) -> None:
                 P[c, r] = P[r, c]
 
 
-@compiled(
-    "void(f8[::1], f8[::1], f8[::1], f8[:,:,::1], f8[:,::1], f8[::1], f8[:,::1])",
-)
-def expect_flow(
-    x: Array, way: Array, seen: Array, T: Array, rock_tilt: Array, expected: Array, H: Array
-) -> None:
-    """Writes the increment that the flow is to tell (3,) rad, and its derivative (3, SIZE).
-
-    Args:
-        x: (n,) at the end of the interval.
-        way: (3,) rad, what multiplies the flow's errors.
-        seen: (3,) rad.
-        T: (3, 3, 3) what a tilt of the camera does.
-        rock_tilt: (3, 2) how rocking tilts it.
-        expected: (3,), written.
-        H: (3, SIZE), written.
-    """
-    tilt, by_tilt = np.empty(3), np.empty((3, 3))
-    H[:] = 0.0
-    for i in range(3):
-        tilt[i] = rock_tilt[i, 0] * x[ROCK] + rock_tilt[i, 1] * x[ROCK + 1]
-    for i in range(3):
-        for k in range(3):
-            H[i, MOUNTING + k] = T[i, 0, k] * way[0] + T[i, 1, k] * way[1] + T[i, 2, k] * way[2]
-            by_tilt[i, k] = H[i, MOUNTING + k]
-            for m in range(3):
-                H[i, STEP + k] += T[i, k, m] * (x[MOUNTING + m] + tilt[m])
-    _add_cross(tilt, 1.0, H, STEP)
-    _add_cross(way, -1.0, by_tilt, 0)
-    for i in range(3):
-        scale = x[SCALE + 1] if i == 2 else x[SCALE]
-        H[i, SCALE + (1 if i == 2 else 0)] = way[i]
-        H[i, STEP + i] += 1.0 + scale
-        expected[i] = seen[i] + scale * way[i]
-        for k in range(3):
-            expected[i] += H[i, MOUNTING + k] * x[MOUNTING + k] + by_tilt[i, k] * tilt[k]
-            for a in range(2):
-                H[i, ROCK + a] += by_tilt[i, k] * rock_tilt[k, a]
-
-
-@compiled()
-def _add_cross(v: Array, sign: float, A: Array, column: int) -> None:
-    """Adds the matrix of the cross product by v (3,) to three columns of A."""
-    x, y, z = sign * v[0], sign * v[1], sign * v[2]
-    A[0, column + 1] -= z
-    A[0, column + 2] += y
-    A[1, column] += z
-    A[1, column + 2] -= x
-    A[2, column] -= y
-    A[2, column + 1] += x
-
-
-@compiled(
-    "f8(f8[:,::1], f8[::1], f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8,"
-    " f8[:,::1], f8[::1], f8[:,::1])",
-)
-def correct(
-    R: Array,
-    x: Array,
-    P: Array,
-    H: Array,
-    y: Array,
-    noise: Array,
-    gate: float,
-    R_after: Array,
-    x_after: Array,
-    P_after: Array,
-) -> float:
-    """Corrects a state by an innovation, unless it is beyond the gate.
-
-    Args:
-        R: (3, 3).
-        x: (n,).
-        P: (n, n).
-        H: (m, k) derivative of the measurement by the first k of the state.
-        y: (m,) the innovation.
-        noise: (m, m).
-        gate: largest squared Mahalanobis distance that is taken.
-        R_after: (3, 3), written if it is taken, as the others.
-        x_after: (n,).
-        P_after: (n, n).
-
-    Returns:
-        The squared Mahalanobis distance; NaN when the innovation's covariance is not positive.
-    """
-    n, (m, k) = len(x), H.shape
-    PH = np.zeros((n, m))
-    for c in range(k):
-        for a in range(m):
-            h = H[a, c]
-            if h != 0.0:
-                for i in range(n):
-                    PH[i, a] += P[c, i] * h
-    S = np.empty((m, m))
-    for a in range(m):
-        for b in range(a + 1):
-            S[a, b] = (noise[a, b] + noise[b, a]) / 2
-            for c in range(k):
-                S[a, b] += (H[a, c] * PH[c, b] + H[b, c] * PH[c, a]) / 2
-    # With S = L L' the rows of W are L^-1 of PH' and of y: K y = W' w, K PH' = W' W.
-    if not solve_positive(S, y.copy()):
-        return math.nan
-    w, W = np.empty(m), np.empty((m, n))
-    distance = 0.0
-    for a in range(m):
-        rest = y[a]
-        for b in range(a):
-            rest -= S[a, b] * w[b]
-        w[a] = rest / S[a, a]
-        distance += w[a] * w[a]
-        for i in range(n):
-            W[a, i] = PH[i, a]
-        for b in range(a):
-            for i in range(n):
-                W[a, i] -= S[a, b] * W[b, i]
-        for i in range(n):
-            W[a, i] /= S[a, a]
-    if not distance <= gate:
-        return distance
-    for i in range(n):
-        x_after[i] = x[i]
-        for a in range(m):
-            x_after[i] += W[a, i] * w[a]
-        # (I - K H) P (I - K H)' + K noise K', multiplied out: only rank m is changed.
-        for j in range(n):
-            P_after[i, j] = P[i, j]
-        for a in range(m):
-            share = W[a, i]
-            for j in range(n):
-                P_after[i, j] -= share * W[a, j]
-    E, bent = np.empty((3, 3)), np.empty((3, 3))
-    rotation_of(x_after[THETA : THETA + 3], E)
-    multiply(E, R, bent)
-    straighten(bent, R_after)
-    for i in range(3):
-        x_after[THETA + i] = x_after[STEP + i] = 0.0
-    return distance
-
-
 @compiled()
 def straighten(bent: Array, R: Array) -> None:
     """Writes the rotation next to a product of rotations, as `angles.nearest_rotation`."""
@@ -423,3 +338,15 @@ def straighten(bent: Array, R: Array) -> None:
             for k in range(3):
                 square = bent[0, k] * bent[0, j] + bent[1, k] * bent[1, j] + bent[2, k] * bent[2, j]
                 R[i, j] -= 0.5 * bent[i, k] * square
+
+
+@compiled()
+def add_cross(v: Array, sign: float, A: Array, column: int) -> None:
+    """Adds the matrix of the cross product by v (3,) to three columns of A."""
+    x, y, z = sign * v[0], sign * v[1], sign * v[2]
+    A[0, column + 1] -= z
+    A[0, column + 2] += y
+    A[1, column] += z
+    A[1, column + 2] -= x
+    A[2, column] -= y
+    A[2, column + 1] += x

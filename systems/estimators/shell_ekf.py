@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.estimators.shell_ekf_parameters import ShellEkfParameters
-from systems.estimators.shell_fusion import REASONS, Memory, Now, ShellFusion
+from systems.estimators.shell_fusion import REASONS, Now, ShellFusion
 from systems.estimators.shell_model import (
     BIAS,
     DELAY,
@@ -32,6 +32,7 @@ from systems.health import Counts
 from systems.markers.layout import MarkerMap
 from systems.messages import PoseEstimate, RotationIncrement
 from systems.shell.angles import angles_of, rotation
+from systems.small_matrices import folded, unfolded
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -141,9 +142,9 @@ class ShellEkf(LeafSystem):
         n = SIZE + 3 * len(markers)
         self._R = self.DeclareDiscreteState(rotation(np.array(p.initial_angles)).ravel())
         self._x = self.DeclareDiscreteState(n)
-        self._P = self.DeclareDiscreteState(p.initial_covariance(len(markers)).ravel())
-        memory = self._fusion.new_memory()
-        self._memory = [self.DeclareDiscreteState(part) for part in memory]
+        # Its lower half: Drake copies all discrete state at each update.
+        self._P = self.DeclareDiscreteState(folded(p.initial_covariance(len(markers))))
+        self._memory = self.DeclareDiscreteState(self._fusion.new_memory())
         self._nis = self.DeclareDiscreteState([np.nan, 0.0])
         self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._step)
         ticket = {self.time_ticket(), self.xd_ticket()}
@@ -222,15 +223,16 @@ class ShellEkf(LeafSystem):
         return np.concatenate([state.x[index], np.sqrt(np.diag(state.P)[index])])
 
     def _state(self, context: Context) -> State:
-        x = context.get_discrete_state(self._x).get_value()
-        R = context.get_discrete_state(self._R).get_value().reshape(3, 3)
-        return State(R, x, context.get_discrete_state(self._P).get_value().reshape(len(x), -1))
+        values = context.get_discrete_state()
+        x = values.get_value(self._x)
+        P = unfolded(values.get_value(self._P), len(x))
+        return State(values.get_value(self._R).reshape(3, 3), x, P)
 
     def _step(self, context: Context, discrete_state: DiscreteValues) -> None:
         t, fusion, uses = context.get_time(), self._fusion, self._fusion.parameters.sensors
-        memory = Memory(*(discrete_state.get_mutable_value(index) for index in self._memory))
+        memory = discrete_state.get_mutable_value(self._memory)
         moves = self._reference_input.HasValue(context)
-        wrong = fusion.listen(
+        bad_imu, bad_reference = fusion.listen(
             t,
             memory,
             self._imu_input.Eval(context) if "imu" in uses else None,
@@ -239,9 +241,9 @@ class ShellEkf(LeafSystem):
         increment = self._increment_input.Eval(context) if "flow" in uses else _NO_INCREMENT
         told = self._marker_pose_input.Eval(context) if "marker" in uses else _NO_POSE
         news = fusion.has_news(t, memory, increment, told)
-        if not (news or wrong):
+        if not (news or bad_imu or bad_reference):
             return
-        counts = Counter(wrong)
+        counts = Counter(bad_imu=bad_imu, bad_reference=bad_reference)
         if news:
             before = self._state(context)
             now = Now(t, before, memory, counts)
@@ -249,24 +251,25 @@ class ShellEkf(LeafSystem):
             if now.state is not before:
                 discrete_state.set_value(self._R, now.state.R.ravel())
                 discrete_state.set_value(self._x, now.state.x)
-                discrete_state.set_value(self._P, now.state.P.ravel())
+                discrete_state.set_value(self._P, folded(now.state.P))
             if not math.isnan(now.nis):
                 number = context.get_discrete_state(self._nis)[1]
                 discrete_state.set_value(self._nis, [now.nis, number + 1])
         self._counts.add(context, discrete_state, **counts)
 
-    def _own(self, context: Context) -> tuple[float, State, Memory]:
-        """Returns the time, the state without the markers, and the memory."""
-        R, x, P = self._state(context)
-        memory = (context.get_discrete_state(index).get_value() for index in self._memory)
-        return context.get_time(), State(R, x[:SIZE], P[:SIZE, :SIZE]), Memory(*memory)
+    def _pose(self, context: Context) -> Array:
+        values = context.get_discrete_state()
+        R, x = values.get_value(self._R).reshape(3, 3), values.get_value(self._x)
+        return self._fusion.pose(context.get_time(), R, x, values.get_value(self._memory))
 
     def _calc_pose(self, context: Context, output: Any) -> None:
-        R, p = self._fusion.pose(*self._own(context))
-        output.set_value(RigidTransform(RotationMatrix(R), p))
+        output.set_value(RigidTransform.MakeUnchecked(self._pose(context)))
 
     def _calc_angles(self, context: Context, output: Any) -> None:
-        output.SetFromVector(angles_of(self._fusion.pose(*self._own(context))[0]))
+        output.SetFromVector(angles_of(self._pose(context)[:, :3]))
 
     def _calc_covariance(self, context: Context, output: Any) -> None:
-        output.SetFromVector(self._fusion.covariance(*self._own(context)).ravel())
+        values = context.get_discrete_state()
+        R, x = values.get_value(self._R).reshape(3, 3), values.get_value(self._x)
+        P, memory = values.get_value(self._P), values.get_value(self._memory)
+        output.SetFromVector(self._fusion.covariance(context.get_time(), R, x, P, memory).ravel())

@@ -23,7 +23,6 @@ All functions are pure; times in seconds. Covariances are in the order of the st
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -31,10 +30,10 @@ from numpy.typing import NDArray
 from pydrake.math import RigidTransform, RotationMatrix
 
 from systems.compiled import packed
-from systems.estimators import shell_arithmetic
+from systems.estimators import shell_arithmetic, shell_correction
 from systems.flow.shell import ShellView, back_project
 from systems.markers.pnp import cross_matrix
-from systems.shell.angles import nearest_rotation, one_rotation, rotation_vector
+from systems.shell.angles import nearest_rotation, one_rotation
 
 Array = NDArray[np.float64]
 
@@ -50,8 +49,6 @@ _GRID = (16, 12)  # pixels by which the camera's tilt is weighed
 _SMALL = 1e-5  # rad, step of a difference quotient
 _IDENTITY = np.eye(3)
 _IN_PLANE = _IDENTITY[:, :2]
-_Z = np.array([0.0, 0.0, 1.0])
-_BY_ROCK = cross_matrix(_Z)[:, :2]  # of the normal, in B
 _NO_WAY = np.zeros(0)
 
 
@@ -181,23 +178,14 @@ class ShellModel:
         self.reach = view.radius + height
         self.arm = view.parameters.camera_height - height  # of the camera over the body's origin
         self.noise = noise
+        self.variances = np.array(noise)  # the same for compiled code
         T, by_turn = tilt_sensitivity(view)
         self._T = packed(T)
         # Rocking about the body's origin carries the camera over the shell, by this part of the
         # angle, and turns it by the rest.
         carried = self.arm / (self.reach + self.arm)
-        self._rock_tilt = (1 - carried) * _IN_PLANE
-        self._rock_step = (1 - carried) * (by_turn - np.eye(3)) @ _IN_PLANE
-
-    def turned(self, state: State, turn: Turn) -> Array:
-        """Returns the body's rotation over the shell during an interval, (3,) rad, in B."""
-        u, factor = np.empty((2, 3))
-        way = _NO_WAY if turn.way is None else packed(turn.way)
-        shell_arithmetic.turned(
-            packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
-            way, u, factor,
-        )  # fmt: skip
-        return u
+        self._rock_tilt = packed((1 - carried) * _IN_PLANE)
+        self.rock_step = packed((1 - carried) * (by_turn - np.eye(3)) @ _IN_PLANE)
 
     def transition(self, state: State, turn: Turn) -> tuple[Array, Array, Array]:
         """Returns the derivatives of one step.
@@ -211,19 +199,9 @@ class ShellModel:
             packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
             packed(turn.rate_before), packed(turn.rate_after),
             _NO_WAY if turn.way is None else packed(turn.way),
-            self._rock_step, self.noise.rock_time, u, F, G,
+            self.rock_step, self.noise.rock_time, u, F, G,
         )  # fmt: skip
         return F, G, u
-
-    def carried(self, state: State, turn: Turn, u: Array) -> tuple[State, Array]:
-        """Returns the state after a step u (3,) rad, and by what the rock has faded (2,) rad.
-
-        Its covariance is left as it was.
-        """
-        R, x, change = np.empty((3, 3)), np.empty_like(state.x), np.empty(2)
-        fading = math.expm1(-turn.dt / self.noise.rock_time)
-        shell_arithmetic.carry(packed(state.R), packed(state.x), u, fading, R, x, change)
-        return State(R, x, state.P), change
 
     def predict(self, state: State, turn: Turn) -> tuple[State, Array, Array]:
         """Carries the state to the end of an interval by the gyro.
@@ -232,16 +210,15 @@ class ShellModel:
             The state, the step (3,) that the body has made, and what the flow is to see of it but
             for its own errors (3,), rad: less the change of the rock.
         """
-        noise = self.noise
-        F, G, u = self.transition(state, turn)
-        step = noise.gyro * turn.dt + noise.lost * turn.lost
-        rock = -noise.rock * math.expm1(-2 * turn.dt / noise.rock_time)
-        bias = noise.bias * turn.dt
-        Q = np.array([step, step, step, rock, rock, bias, bias, bias])
-        P = np.array(state.P, order="C")
-        shell_arithmetic.propagate(P, F, G, Q)  # the markers stay where they are
-        after, change = self.carried(state, turn, u)
-        return State(after.R, after.x, P), u, u + self._rock_step @ change
+        after = _like(state)
+        u, seen = np.empty(3), np.empty(3)
+        shell_arithmetic.predict(
+            *_parts(state), packed(turn.gyro), packed(turn.reference), turn.dt,
+            packed(turn.rate_before), packed(turn.rate_after), turn.lost,
+            _NO_WAY if turn.way is None else packed(turn.way),
+            self.variances, self.rock_step, *after, u, seen,
+        )  # fmt: skip
+        return after, u, seen
 
     def flow(self, state: State, way: Array, seen: Array) -> tuple[Array, Array]:
         """Returns the increment that the flow is to tell, and its derivative.
@@ -255,45 +232,10 @@ class ShellModel:
             (3,) rad, in B, and (3, SIZE) by the state.
         """
         expected, H = np.empty(3), np.empty((3, SIZE))
-        shell_arithmetic.expect_flow(
+        shell_correction.expect_flow(
             packed(state.x), packed(way), packed(seen), self._T, self._rock_tilt, expected, H
         )
         return expected, H
-
-    def place(self, state: State) -> tuple[Array, Array]:
-        """Returns where the body's origin is, and its derivative.
-
-        Returns:
-            (3,) m, in R, and (3, SIZE) by the state.
-        """
-        p = self.position(state)
-        H = np.zeros((3, SIZE))
-        H[:, THETA] = -cross_matrix(p)
-        H[:, ROCK] = self.reach * state.R @ _BY_ROCK
-        return p, H
-
-    def position(self, state: State) -> Array:
-        """Returns where the body's origin is, (3,) m, in R."""
-        p = np.empty(3)
-        shell_arithmetic.stand(packed(state.R), packed(state.x), self.reach, p)
-        return p
-
-    def pose_after(self, state: State, turn: Turn) -> tuple[Array, Array]:
-        """Returns rotation (3, 3) and place (3,) m, in R, at the end of an interval."""
-        R, p = np.empty((3, 3)), np.empty(3)
-        shell_arithmetic.pose_after(
-            packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
-            math.expm1(-turn.dt / self.noise.rock_time), self.reach, R, p,
-        )  # fmt: skip
-        return R, p
-
-    def pose_covariance(self, state: State) -> Array:
-        """Returns the covariance (6, 6) of rotation and place, in R, of a state without markers."""
-        covariance = np.empty((6, 6))
-        shell_arithmetic.pose_covariance(
-            packed(state.R), packed(state.x), packed(state.P), self.reach, covariance
-        )
-        return covariance
 
     def marker_pose(self, state: State, marker: int) -> tuple[Array, Array, Array]:
         """Returns the pose that a picture of a marker is to tell, and its derivative.
@@ -306,20 +248,12 @@ class ShellModel:
             (3, 3) and (3,): the pose, in R. (6, n) by the state: a small rotation vector in R, then
             the position.
         """
-        R, x = state.R, state.x
-        p, by_base = self.place(state)
-        away = one_rotation(-x[marker_slice(marker)])
-        mounting = one_rotation(x[MOUNTING])
-        arm = self.arm * _Z
-        told = away @ (p + R @ (arm - mounting @ arm))
-        H = np.zeros((6, len(x)))
-        H[:3, THETA] = away
-        H[:3, MOUNTING] = away @ R
-        H[:3, marker_slice(marker)] = -np.eye(3)
-        H[3:, :SIZE] = away @ by_base
-        H[3:, MOUNTING] = self.arm * away @ R @ cross_matrix(_Z)
-        H[3:, marker_slice(marker)] = cross_matrix(told)
-        return away @ R @ mounting, told, H
+        R, p, H = np.empty((3, 3)), np.empty(3), np.empty((6, len(state.x)))
+        shell_correction.expect_marker(
+            packed(state.R), packed(state.x), marker_slice(marker).start, self.arm, self.reach,
+            R, p, H,
+        )  # fmt: skip
+        return R, p, H
 
     def start(self, state: State, R_told: Array, marker: int, variance: float) -> State:
         """Returns a state whose rotation is that of a marker pose, known only roughly."""
@@ -330,35 +264,61 @@ class ShellModel:
         P[THETA, THETA] = variance * np.eye(3)
         return State(nearest_rotation(R), state.x, P)
 
+    def marker_pose_now(
+        self, state: State, turn: Turn, R: Array, p: Array, noise: tuple[Array, Array, float]
+    ) -> tuple[Array, Array, Array]:
+        """Carries a marker pose R (3, 3), p (3,) m by what the body turns in an interval.
+
+        Args:
+            state: tells what is wrong with the gyro.
+            turn: from the picture of the marker to the state's time.
+            R: (3, 3).
+            p: (3,) m.
+            noise: its covariance (6, 6), what is added to it, and variance along the normal, m^2.
+
+        Returns:
+            Rotation, place and covariance at the end of it.
+        """
+        R_now, p_now, noise_now = np.empty((3, 3)), np.empty(3), np.empty((6, 6))
+        covariance, floor, height = noise
+        shell_correction.carry_marker_pose(
+            packed(state.R), packed(state.x), packed(turn.gyro), packed(turn.reference), turn.dt,
+            packed(R), packed(p), packed(covariance), floor, height, R_now, p_now, noise_now,
+        )  # fmt: skip
+        return R_now, p_now, noise_now
+
     def update_flow(
         self, state: State, seen: Array, told: Array, noise: Array, gate: float
     ) -> Update:
         """Weighs an increment (3,) rad with covariance (3, 3)."""
-        expected, H = self.flow(state, told, seen)
-        return corrected(state, H, told - expected, noise, gate)
+        after = _like(state)
+        distance = shell_correction.weigh_flow(
+            *_parts(state), packed(seen), packed(told), packed(noise), gate,
+            self._T, self._rock_tilt, *after,
+        )  # fmt: skip
+        return _update(state, after, distance, gate, 3)
 
     def update_marker(
         self, state: State, marker: int, R_told: Array, p_told: Array, noise: Array, gate: float
     ) -> Update:
         """Weighs a marker pose with covariance (6, 6)."""
-        R, p, H = self.marker_pose(state, marker)
-        y = np.concatenate([rotation_vector(R_told @ R.T), p_told - p])
-        return corrected(state, H, y, noise, gate)
+        after = _like(state)
+        distance = shell_correction.weigh_marker(
+            *_parts(state), marker_slice(marker).start, self.arm, self.reach,
+            packed(R_told), packed(p_told), packed(noise), gate, *after,
+        )  # fmt: skip
+        return _update(state, after, distance, gate, 6)
 
 
-def corrected(state: State, H: Array, y: Array, noise: Array, gate: float) -> Update:
-    """Corrects a state by an innovation, unless it is beyond the gate.
+def _parts(state: State) -> tuple[Array, Array, Array]:
+    return packed(state.R), packed(state.x), packed(state.P)
 
-    Args:
-        state: before.
-        H: (m, k) derivative of the measurement by the first k of the state.
-        y: (m,) what was measured less what was expected.
-        noise: (m, m).
-        gate: largest squared Mahalanobis distance that is taken.
-    """
-    R, x, P = (np.empty_like(part, order="C") for part in state)
-    distance = shell_arithmetic.correct(
-        packed(state.R), packed(state.x), packed(state.P), H, y, packed(noise), float(gate), R, x, P
-    )
+
+def _like(state: State) -> State:
+    """Returns a state of that size to be written."""
+    return State(np.empty((3, 3)), np.empty_like(state.x), np.empty_like(state.P, order="C"))
+
+
+def _update(before: State, after: State, distance: float, gate: float, unknowns: int) -> Update:
     accepted = 0 <= distance <= gate
-    return Update(State(R, x, P) if accepted else state, distance / len(y), accepted)
+    return Update(after if accepted else before, distance / unknowns, accepted)

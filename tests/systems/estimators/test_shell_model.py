@@ -7,6 +7,7 @@ import pytest
 from pydrake.math import RigidTransform, RotationMatrix
 from scipy.spatial.transform import Rotation
 
+from systems.estimators.shell_correction import correct
 from systems.estimators.shell_ekf_parameters import ShellEkfParameters
 from systems.estimators.shell_model import (
     BIAS,
@@ -21,7 +22,6 @@ from systems.estimators.shell_model import (
     ShellModel,
     State,
     Turn,
-    corrected,
     marker_slice,
 )
 from systems.flow.projector import FlowProjectorParameters, project_flow
@@ -51,6 +51,11 @@ def some_state(seed: int = 0, markers: int = 2) -> State:
     x[GYRO] = rng.normal(0, 0.01, 9)
     x[SIZE:] = rng.normal(0, 0.01, 3 * markers)
     return State(Rotation.random(random_state=seed).as_matrix(), x, np.eye(len(x)))
+
+
+def nowhere(state: State) -> State:
+    """What a corrected state is written to."""
+    return State(*(np.full_like(part, np.nan) for part in state))
 
 
 def moved(state: State, i: int, by: float) -> State:
@@ -160,7 +165,7 @@ def test_turned_and_rocking_cameras_tell_what_the_model_says(
     state = some_state()
     x = np.zeros_like(state.x)
     x[MOUNTING], x[ROCK] = np.array(m) * DEG, (rocks[0] + rocks[1]) / 2
-    seen = step + MODEL._rock_step @ (rocks[1] - rocks[0])
+    seen = step + MODEL.rock_step @ (rocks[1] - rocks[0])
     expected, _ = MODEL.flow(state._replace(x=x), told, seen)
     np.testing.assert_allclose(told, expected, atol=0.0015 * DEG)
     assert np.abs(told - step).max() > 0.002 * DEG  # the step alone would not do
@@ -223,27 +228,41 @@ def test_a_correction_is_that_of_the_joseph_form() -> None:
     root = rng.normal(0, 0.01, (len(state.x), len(state.x)))
     state = state._replace(P=root @ root.T)
     H, y, noise = rng.normal(0, 1, (3, SIZE)), rng.normal(0, 0.01, 3), np.diag([1e-4, 2e-4, 3e-4])
-    found = corrected(state, H, y, noise, math.inf)
+    R, x, P = after = nowhere(state)
+    distance = correct(*state, H, y, noise, math.inf, *after)
     full = np.hstack([H, np.zeros((3, len(state.x) - SIZE))])
     S = full @ state.P @ full.T + noise
     K = state.P @ full.T @ np.linalg.inv(S)
     A = np.eye(len(state.x)) - K @ full
-    np.testing.assert_allclose(found.state.P, A @ state.P @ A.T + K @ noise @ K.T, atol=1e-12)
-    np.testing.assert_allclose(found.state.R, exp((K @ y)[THETA]) @ state.R, atol=1e-9)
-    assert found.nis == pytest.approx(y @ np.linalg.solve(S, y) / 3)
-    refused = corrected(state, H, y, noise, 0.5 * 3 * found.nis)
-    assert not refused.accepted
-    assert refused.state is state
+    np.testing.assert_allclose(P, A @ state.P @ A.T + K @ noise @ K.T, atol=1e-12)
+    np.testing.assert_allclose(R, exp((K @ y)[THETA]) @ state.R, atol=1e-9)
+    np.testing.assert_allclose(x[BIAS], (state.x + K @ y)[BIAS], atol=1e-12)
+    assert distance == pytest.approx(y @ np.linalg.solve(S, y))
+    refused = nowhere(state)
+    assert correct(*state, H, y, noise, 0.5 * distance, *refused) == distance
+    assert all(np.isnan(part).all() for part in refused)
 
 
 def test_an_innovation_whose_covariance_is_not_positive_is_refused() -> None:
     state = some_state(6)
     state = state._replace(P=1e-6 * np.eye(len(state.x)))
-    H = np.eye(3, SIZE)
-    refused = corrected(state, H, np.full(3, 1e-3), np.diag([1e-4, -1e-3, 1e-4]), math.inf)
+    H, y, noise = np.eye(3, SIZE), np.full(3, 1e-3), np.diag([1e-4, -1e-3, 1e-4])
+    refused = nowhere(state)
+    assert math.isnan(correct(*state, H, y, noise, math.inf, *refused))
+    assert all(np.isnan(part).all() for part in refused)
+
+
+def test_an_increment_that_is_not_believed_changes_nothing() -> None:
+    state = some_state(6)
+    state = state._replace(P=1e-6 * np.eye(len(state.x)))
+    told = np.full(3, 1e-3)
+    refused = MODEL.update_flow(state, np.zeros(3), told, 1e-6 * np.eye(3), 1e-6)
+    assert refused.nis > 0
     assert not refused.accepted
     assert refused.state is state
-    assert math.isnan(refused.nis)
+    refused = MODEL.update_flow(state, np.zeros(3), told, -1e-3 * np.eye(3), math.inf)
+    assert not refused.accepted
+    assert refused.state is state
 
 
 # --- The trail ---
