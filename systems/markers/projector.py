@@ -19,6 +19,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, InputPort, OutputPort
 
 from systems.cameras import PinholeCamera
+from systems.compiled import compiled
 from systems.markers.corner_noise import corner_deviation
 from systems.markers.family import Family
 from systems.markers.layout import MarkerMap
@@ -40,7 +41,7 @@ def project_markers(
     sizes: Array,
     cells: int,
     parameters: ProjectorParameters,
-    random: np.random.Generator,
+    random: np.random.Generator | Callable[[], np.random.Generator],
     solids: Solids | Callable[[], Solids] | None = None,
 ) -> tuple[NDArray[np.intp], Array]:
     """Returns which markers are found and where their corners are found.
@@ -54,14 +55,12 @@ def project_markers(
         sizes: (n,) sides of the black squares, m.
         cells: cells along a side of the black square.
         parameters: limits, noise and misses.
-        random: where the noise comes from.
+        random: where the noise comes from, or what gives it: asked only when a marker is visible.
         solids: see `visible_markers`.
 
     Returns:
         (m,) index of the markers, ascending, and (m, 4, 2) px.
     """
-    noise = random.standard_normal((len(sizes), 4, 2))
-    found = random.random(len(sizes)) >= parameters.miss_probability
     visible = visible_markers(
         camera=camera,
         X_WC=X_WC,
@@ -71,6 +70,12 @@ def project_markers(
         parameters=parameters,
         solids=solids,
     )
+    if callable(random):
+        if not len(visible.index):
+            return visible.index, visible.corners
+        random = random()
+    noise = random.standard_normal((len(sizes), 4, 2))
+    found = random.random(len(sizes)) >= parameters.miss_probability
     deviation = corner_deviation(
         visible.corners, parameters.pixel_noise, parameters.pixel_noise_by_side
     )
@@ -216,9 +221,11 @@ class MarkerProjector(SampledSensor):
             sizes=self._sizes,
             cells=self._family.cells,
             parameters=self._parameters,
-            random=self._noise.generator(context, index),
+            random=lambda: self._noise.generator(context, index),
             solids=lambda: self._solids(context, query_object),
         )
+        if not len(found):
+            return Detections(stamp, self._frame_id, self._family.name)
         return Detections(
             stamp=stamp,
             frame_id=self._frame_id,
@@ -232,7 +239,18 @@ class MarkerProjector(SampledSensor):
     def _marker_poses(self, query_object: QueryObject) -> Array:
         if not self._frames:
             return self._X_FM
-        X_WF = frame_poses(query_object, self._frames)[self._frame_of_marker]
-        X_WM = X_WF[:, :, :3] @ self._X_FM
-        X_WM[:, :, 3] += X_WF[:, :, 3]
+        X_WM = np.empty(self._X_FM.shape)
+        _place(frame_poses(query_object, self._frames), self._frame_of_marker, self._X_FM, X_WM)
         return X_WM
+
+
+@compiled("void(f8[:,:,::1], i8[::1], f8[:,:,::1], f8[:,:,::1])")
+def _place(X_WF: Array, frames: NDArray[np.intp], X_FM: Array, X_WM: Array) -> None:
+    """Writes the poses (n, 3, 4) of n markers, each in one of the frames (..., 3, 4)."""
+    for n in range(len(frames)):
+        X_WP = X_WF[frames[n]]
+        for i in range(3):
+            for j in range(4):
+                X_WM[n, i, j] = X_WP[i, 3] if j == 3 else 0.0
+                for k in range(3):
+                    X_WM[n, i, j] += X_WP[i, k] * X_FM[n, k, j]

@@ -124,28 +124,27 @@ def visible_markers(
             to hide, for in most pictures of many robots there is none.
     """
     n, p = len(sizes), parameters
-    outline = _OUTLINE.copy()
-    outline[5:] *= 1 + 2 * p.white_margin / cells
     limits = np.array(
         (
             camera.width, camera.height, camera.fold_radius, math.cos(p.max_incidence),
-            p.max_range, p.min_side_px, p.border_px,
+            p.max_range, p.min_side_px, p.border_px, 1 + 2 * p.white_margin / cells,
         )
     )  # fmt: skip
     index, pixels, points = np.empty(n, np.intp), np.empty((n, 4, 2)), np.empty((n, 5, 3))
     side, distance, cosine = np.empty(n), np.empty(n), np.empty(n)
     pose = in_rows(X_WC.GetAsMatrix34(), 4)
     m = _find(
-        pose, in_rows(X_WM, 3, 4), packed(sizes), outline, *camera.matrices, limits,
+        pose, in_rows(X_WM, 3, 4), packed(sizes), _OUTLINE, *camera.matrices, limits,
         index, pixels, points, side, distance, cosine,
     )  # fmt: skip
-    seen = np.arange(m)
+    index, pixels, side, cosine = index[:m], pixels[:m], side[:m], cosine[:m]
     if m and solids is not None:
         hidden = np.empty(m, bool)
         standing = solids() if callable(solids) else solids
         _hide(standing.arrays, pose, points[:m], distance[:m], hidden)
-        seen = seen[~hidden]
-    return VisibleMarkers(index[seen], pixels[seen], side[seen], np.arccos(cosine[seen]))
+        seen = ~hidden
+        index, pixels, side, cosine = index[seen], pixels[seen], side[seen], cosine[seen]
+    return VisibleMarkers(index, pixels, side, np.arccos(cosine))
 
 
 @compiled(
@@ -173,11 +172,11 @@ def _find(
         X_WC: (3, 4).
         X_WM: (n, 3, 4).
         sizes: (n,) m.
-        outline: (9, 3) corners, centre, corners of the margin; of a marker of size 1.
+        outline: (9, 3) corners, centre, corners of the margin; of a marker and a margin of size 1.
         K: (3, 3) px.
         D: (5,).
         limits: width (px), height (px), radius of the distortion's fold, cosine of the incidence,
-            range (m), narrow side (px), border (px).
+            range (m), narrow side (px), border (px), size of the margin.
         index: (n,) the first of them written, as of all that follow: which markers.
         pixels: (n, 4, 2) corners, px.
         points: (n, 5, 3) corners and centre, m.
@@ -201,10 +200,11 @@ def _find(
             continue
         inside = True
         for q in range(len(outline)):
+            size = sizes[n] if q < 5 else sizes[n] * limits[7]
             for i in range(3):
                 p_W[i] = X_WM[n, i, 3]
                 for j in range(3):
-                    p_W[i] += X_WM[n, i, j] * outline[q, j] * sizes[n]
+                    p_W[i] += X_WM[n, i, j] * outline[q, j] * size
                 from_camera[i] = p_W[i] - X_WC[i, 3]
             x, y, z = 0.0, 0.0, 0.0
             for i in range(3):
