@@ -7,15 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydrake.common.eigen_geometry import Quaternion
 from pydrake.common.value import AbstractValue
-from pydrake.math import RigidTransform, RotationMatrix
+from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, EventStatus, InputPort, OutputPort, State
 
 from systems.cameras import PinholeCamera
-from systems.flow.shell import back_project, inside, project
+from systems.compiled import compiled, in_rows
+from systems.flow.shell import meet_sphere, see
 from systems.messages import PointMatches
 from systems.noise import NoiseStream
+from systems.plumb_bob import find_rays
 from systems.sensors.sampled import SampledSensor
 from systems.validation import require, require_non_negative, require_positive
 
@@ -80,17 +81,90 @@ def project_flow(
     Returns:
         (n, 2) px in the earlier picture, and (n, 2) px in the later one.
     """
-    p = parameters
-    lost = random.random() < p.picture_dropout
-    previous = random.random((p.points, 2)) * [camera.width, camera.height] - 0.5
-    noise = p.pixel_noise * random.standard_normal((p.points, 2))
-    wrong = random.random(p.points) < p.outlier_share
-    noise += wrong[:, None] * p.outlier_px * random.standard_normal((p.points, 2))
-    found = random.random(p.points) >= p.point_dropout
-    current = project(camera, X_RC, back_project(camera, X_RC_before, radius, previous))
-    current = previous + (1 + p.scale_error) * (current - previous) + noise
-    found &= inside(camera, current) & (not lost)
-    return previous[found], current[found]
+    p, n = parameters, parameters.points
+    places = random.random(1 + 2 * n)
+    noise = random.standard_normal((n, 2))
+    wrong = random.random(n)
+    outliers = random.standard_normal((n, 2))
+    dropped = random.random(n)
+    if places[0] < p.picture_dropout:
+        return np.empty((0, 2)), np.empty((0, 2))
+    previous, current = np.empty((n, 2)), np.empty((n, 2))
+    options = np.array(
+        (p.pixel_noise, p.outlier_share, p.outlier_px, p.scale_error, p.point_dropout)
+    )
+    count = _match(
+        float(camera.width), float(camera.height), *camera.matrices, camera.fold_radius,
+        in_rows(X_RC_before.GetAsMatrix34(), 4), in_rows(X_RC.GetAsMatrix34(), 4), radius,
+        options, places[1:], noise, wrong, outliers, dropped, previous, current,
+    )  # fmt: skip
+    return previous[:count], current[:count]
+
+
+@compiled(
+    "i8(f8, f8, f8[:,::1], f8[::1], f8, f8[:,::1], f8[:,::1], f8, f8[::1], f8[::1], f8[:,::1],"
+    " f8[::1], f8[:,::1], f8[::1], f8[:,::1], f8[:,::1])"
+)
+def _match(
+    width: float,
+    height: float,
+    K: Array,
+    D: Array,
+    fold_radius: float,
+    before: Array,
+    now: Array,
+    radius: float,
+    options: Array,
+    places: Array,
+    noise: Array,
+    wrong: Array,
+    outliers: Array,
+    dropped: Array,
+    previous: Array,
+    current: Array,
+) -> int:
+    """Writes the matches of n points and returns how many they are.
+
+    Args:
+        width: of the picture, px.
+        height: px.
+        K: (3, 3) px.
+        D: (5,).
+        fold_radius: see `PinholeCamera`.
+        before: (3, 4) pose of the optical frame in R.
+        now: (3, 4).
+        radius: m.
+        options: noise (px), share and deviation (px) of outliers, scale error, share of losses.
+        places: (2 n,) 0 to 1, where in the picture the points are.
+        noise: (n, 2) of standard deviation 1.
+        wrong: (n,) 0 to 1, which are outliers.
+        outliers: (n, 2) of standard deviation 1.
+        dropped: (n,) 0 to 1, which are lost.
+        previous: (n, 2) the first of them written, px.
+        current: (n, 2) the first of them written, px.
+    """
+    n = len(wrong)
+    pixels, seen = np.empty((n, 2)), np.empty((n, 2))
+    rays, by_ray, points = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((n, 3))
+    for k in range(n):
+        pixels[k, 0], pixels[k, 1] = places[2 * k] * width - 0.5, places[2 * k + 1] * height - 0.5
+    find_rays(pixels, K, D, fold_radius, rays, by_ray)
+    meet_sphere(rays, before[:, :3].copy(), before[:, 3].copy(), radius, points)
+    see(points, now[:, :3].copy(), now[:, 3].copy(), K, D, fold_radius, seen)
+    count = 0
+    for k in range(n):
+        if dropped[k] < options[4]:
+            continue
+        beyond = options[2] if wrong[k] < options[1] else 0.0
+        u, v = pixels[k, 0], pixels[k, 1]
+        x = u + (1 + options[3]) * (seen[k, 0] - u) + options[0] * noise[k, 0]
+        y = v + (1 + options[3]) * (seen[k, 1] - v) + options[0] * noise[k, 1]
+        x, y = x + beyond * outliers[k, 0], y + beyond * outliers[k, 1]
+        if x >= -0.5 and y >= -0.5 and x <= width - 0.5 and y <= height - 0.5:  # NaN is not
+            previous[count, 0], previous[count, 1] = u, v
+            current[count, 0], current[count, 1] = x, y
+            count += 1
+    return count
 
 
 class FlowProjector(SampledSensor):
@@ -150,8 +224,8 @@ class FlowProjector(SampledSensor):
         self._pose_input = self.DeclareAbstractInputPort(
             "pose", AbstractValue.Make(RigidTransform())
         )
-        # Stamp, quaternion and position of the camera at the last picture.
-        self._last = self.DeclareDiscreteState(np.array([math.nan, 1, 0, 0, 0, 0, 0, 0]))
+        # Stamp, and rotation and position of the camera, row by row, at the last picture.
+        self._last = self.DeclareDiscreteState(np.append(math.nan, np.eye(3, 4)))
         self._matches_output = self._declare_sampling(
             name="matches",
             rate=rate,
@@ -175,7 +249,7 @@ class FlowProjector(SampledSensor):
         previous, current = project_flow(
             camera=self._camera,
             radius=self._radius,
-            X_RC_before=RigidTransform(RotationMatrix(Quaternion(last[1:5])), last[5:]),
+            X_RC_before=RigidTransform.MakeUnchecked(last[1:].reshape(3, 4)),
             X_RC=self._pose_input.Eval(context),
             parameters=self._parameters,
             random=self._noise.generator(context, index),
@@ -185,8 +259,7 @@ class FlowProjector(SampledSensor):
     def _take(self, context: Context, state: State) -> EventStatus:
         status = super()._take(context, state)
         X_RC: RigidTransform = self._pose_input.Eval(context)
-        wxyz = X_RC.rotation().ToQuaternion().wxyz()
-        stamp = self._stamp(context.get_time())
-        last = np.concatenate([[stamp], wxyz, X_RC.translation()])
-        state.get_mutable_discrete_state().set_value(self._last, last)
+        last = state.get_mutable_discrete_state().get_mutable_value(self._last)
+        last[0] = self._stamp(context.get_time())
+        last[1:] = X_RC.GetAsMatrix34().ravel()
         return status

@@ -71,12 +71,12 @@ def back_project(
     """
     points = np.empty((len(pixels), 3))
     R, p = packed(X_SC.rotation().matrix()), packed(X_SC.translation())
-    _meet_sphere(in_rows(camera.undistort(pixels), 2), R, p, radius, points)
+    meet_sphere(in_rows(camera.undistort(pixels), 2), R, p, radius, points)
     return points
 
 
 @compiled("void(f8[:,::1], f8[:,::1], f8[::1], f8, f8[:,::1])")
-def _meet_sphere(rays: Array, R: Array, p: Array, radius: float, points: Array) -> None:
+def meet_sphere(rays: Array, R: Array, p: Array, radius: float, points: Array) -> None:
     """Writes where rays (n, 2) x/z, y/z of a camera at R, p meet a sphere about the origin."""
     square = p[0] * p[0] + p[1] * p[1] + p[2] * p[2] - radius * radius
     d = np.empty(3)
@@ -107,12 +107,12 @@ def project(camera: PinholeCamera, X_SC: RigidTransform, points: Array) -> Array
     """
     pixels = np.empty((len(points), 2))
     R, p = packed(X_SC.rotation().matrix()), packed(X_SC.translation())
-    _see(in_rows(points, 3), R, p, *camera.matrices, camera.fold_radius, pixels)
+    see(in_rows(points, 3), R, p, *camera.matrices, camera.fold_radius, pixels)
     return pixels
 
 
 @compiled("void(f8[:,::1], f8[:,::1], f8[::1], f8[:,::1], f8[::1], f8, f8[:,::1])")
-def _see(
+def see(
     points: Array, R: Array, p: Array, K: Array, D: Array, fold_radius: float, pixels: Array
 ) -> None:
     """Writes the pixels (n, 2) that show points (n, 3) to a camera at R, p; NaN where none does."""
@@ -156,9 +156,9 @@ def _matched(
     n = len(previous)
     rays, by_ray, met = np.empty((n, 2)), np.empty((n, 2, 2)), np.empty((2, n, 3))
     find_rays(previous, K, D, fold_radius, rays, by_ray)
-    _meet_sphere(rays, R, p, radius, met[0])
+    meet_sphere(rays, R, p, radius, met[0])
     find_rays(current, K, D, fold_radius, rays, by_ray)
-    _meet_sphere(rays, R, p, radius, met[1])
+    meet_sphere(rays, R, p, radius, met[1])
     count = 0
     for k in range(n):
         serves = math.isfinite(met[0, k, 0]) and math.isfinite(met[1, k, 0])
