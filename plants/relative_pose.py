@@ -37,7 +37,7 @@ class RelativePose(LeafSystem):
         super().__init__()
         self._parent = parent
         self._child = child
-        self._X_CF = X_CF
+        self._X_CF = X_CF or RigidTransform()
         self._query_input = self.DeclareAbstractInputPort(
             "query_object", AbstractValue.Make(QueryObject())
         )
@@ -58,9 +58,9 @@ class RelativePose(LeafSystem):
 
     def _calc_pose(self, context: Context, output: Any) -> None:
         query = self._query_input.Eval(context)
-        X_WP, X_WC = (query.GetPoseInWorld(frame) for frame in (self._parent, self._child))
-        X_PC = X_WP.InvertAndCompose(X_WC)
-        output.set_value(X_PC if self._X_CF is None else X_PC @ self._X_CF)
+        X_WC: RigidTransform = query.GetPoseInWorld(self._child)
+        X_CP = X_WC.InvertAndCompose(query.GetPoseInWorld(self._parent))
+        output.set_value(X_CP.InvertAndCompose(self._X_CF))
 
 
 class FramePose(LeafSystem):
