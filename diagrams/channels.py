@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydrake.math import RigidTransform
 
 from diagrams.schema import ScenarioError
 from systems.angles import planar_pose
@@ -24,6 +25,7 @@ from systems.io.ros_motion import (
     planar_fields,
     planar_pose_to_ros,
     planar_transforms_to_ros,
+    pose_fields,
     pose_from_ros,
     pose_to_ros,
 )
@@ -31,8 +33,10 @@ from systems.io.ros_types import message_class
 from systems.io.ros_wheels import wheel_angles_from_ros, wheel_angles_to_ros
 from systems.io.stencils import Stencil
 from systems.messages import CameraImage, Detections, PointMatches, PoseEstimate, Scan
-from systems.pose_vector import pose_from_vector, pose_to_vector
+from systems.pose_vector import pose_to_vector
 from systems.shell.angles import SHELL_FRAME
+
+_NOWHERE = RigidTransform.MakeUnchecked(np.full((3, 4), np.nan))  # for stencils
 
 
 @dataclass(frozen=True)
@@ -251,7 +255,7 @@ def shell_truth_signal(robot: str) -> Signal:
     return Signal(
         port=f"truth.{robot}.pose",
         topic=f"/truth/{robot}/pose",
-        encode=lambda value, t: pose_to_ros(pose_from_vector(value), stamp=t, frame_id=SHELL_FRAME),
+        encode=Stencil(lambda t: pose_to_ros(_NOWHERE, stamp=t, frame_id=SHELL_FRAME), pose_fields),
         decode=lambda message: pose_to_vector(pose_from_ros(message)),
         model=7,
         rate=50.0,
@@ -267,13 +271,8 @@ def shell_estimate_signal(robot: str, rate: float) -> Signal:
     return Signal(
         port=f"{robot}.estimate",
         topic=f"/{robot}/estimate",
-        encode=lambda value, t: estimate_to_ros(
-            PoseEstimate(
-                stamp=t,
-                frame_id=SHELL_FRAME,
-                pose=pose_from_vector(value),
-                covariance=value[7:].reshape(6, 6),
-            )
+        encode=Stencil(
+            lambda t: estimate_to_ros(PoseEstimate(t, SHELL_FRAME, pose=_NOWHERE)), pose_fields
         ),
         decode=None,
         model=43,

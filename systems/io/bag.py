@@ -142,9 +142,9 @@ class BagWriter:
         if failure is not None:
             raise failure
 
-    def chunk(self, log_time: float) -> int:
-        """Returns which chunk a message of this time (s) goes into; another one ends the last."""
-        return nanoseconds(log_time) // self._chunk_length
+    def chunk_end(self, log_time: float) -> float:
+        """Returns when (s) the chunk ends that a message of this time (s) goes into."""
+        return seconds((nanoseconds(log_time) // self._chunk_length + 1) * self._chunk_length)
 
     def flush(self) -> None:
         """Ends the chunk and writes it.

@@ -102,7 +102,9 @@ class _Tap:
 
     def is_due(self, value: Any, t: float) -> bool:
         """Whether a value is to be written at `t` (s); then it counts as written."""
-        if self.repeat > 0:
+        if self.is_vector and self.repeat == 0:
+            return True
+        if self.is_vector:
             now = value.tobytes()
             if now == self.vector and t < self.since + self.repeat - 1e-9:
                 return False
@@ -178,7 +180,7 @@ class Recorder(LeafSystem):
         # Made into ROS messages when a chunk begins, all at once: one after the other, between
         # what else a simulation does, takes twice as long.
         self._waiting: list[tuple[_Tap, Any, float]] = []
-        self._chunk: int | None = None
+        self._chunk_end = -math.inf  # s
         self._warned: set[str] = set()
         groups: dict[float, list[_Tap]] = {}
         for channel in channels:
@@ -234,9 +236,8 @@ class Recorder(LeafSystem):
                 # Of a pose Drake shows the one in its cache, which will change.
                 kept = value.copy() if tap.is_vector else copy(value)
                 self._waiting.append((tap, kept, t))
-        chunk = self._writer.chunk(t)
-        if chunk != self._chunk:
-            self._chunk = chunk
+        if t >= self._chunk_end:
+            self._chunk_end = self._writer.chunk_end(t)
             self._write_waiting()
 
     def _write_waiting(self) -> None:

@@ -6,18 +6,32 @@ was in the earlier one, and how much older that one was, which a cloud has no ot
 
 from __future__ import annotations
 
+import math
+import struct
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from systems.io.ros_types import header, message_class, nanoseconds, seconds, time_from_ros
+from systems.io.ros_types import (
+    header,
+    message_class,
+    nanoseconds,
+    sec_and_nanosec,
+    seconds,
+    time_from_ros,
+    typestore,
+)
+from systems.io.stencils import SerialisedMessage
 from systems.messages import PointMatches
 from systems.validation import require
 
 _PLACES = ("u", "v", "previous_u", "previous_v")  # px
 _AGE = "previous_age"  # ns before the header's stamp, as lidars tell the times of their points
 _POINT = np.dtype([*((name, "<f8") for name in _PLACES), (_AGE, "<u4")])
+_PLACED = np.dtype([("now", "<f8", 2), ("before", "<f8", 2), (_AGE, "<u4")])  # the same
+_TIME, _LENGTH, _LENGTHS = struct.Struct("=iI"), struct.Struct("=I"), struct.Struct("=II")
 # By the numbers of sensor_msgs/msg/PointField.
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _NUMBERS = {kind: number for number, kind in _TYPES.items()}
@@ -33,6 +47,55 @@ def matches_to_ros(matches: PointMatches) -> Any:
         ValueError: a stamp that is not finite, or the earlier picture is not earlier, or by more
             than 4 s.
     """
+    points = _cloud(matches)
+    field = message_class("sensor_msgs/msg/PointField")
+    return message_class("sensor_msgs/msg/PointCloud2")(
+        header=header(matches.stamp, matches.frame_id),
+        height=1,
+        width=len(points),
+        fields=[
+            field(name, 8 * k, _NUMBERS[_POINT[name].str[1:]], 1)
+            for k, name in enumerate((*_PLACES, _AGE))
+        ],
+        is_bigendian=False,
+        point_step=_POINT.itemsize,
+        row_step=points.size,
+        data=points.ravel(),
+        is_dense=_is_dense(matches),
+    )
+
+
+def serialised_matches(matches: PointMatches) -> SerialisedMessage:
+    """Returns the bytes of what `matches_to_ros` returns, and raises what it raises.
+
+    Their number changes, so no stencil of `systems.io.stencils` fits them.
+    """
+    points = _cloud(matches)
+    before, after = _around(matches.frame_id)
+    n = len(points)
+    data = b"".join(
+        (
+            before[:4], _TIME.pack(*sec_and_nanosec(matches.stamp)), before[12:],
+            _LENGTH.pack(n), after, _LENGTHS.pack(points.size, points.size), points.tobytes(),
+            b"\1" if _is_dense(matches) else b"\0",
+        )
+    )  # fmt: skip
+    return SerialisedMessage("sensor_msgs/msg/PointCloud2", data)
+
+
+@lru_cache
+def _around(frame_id: str) -> tuple[bytes, bytes]:
+    """Returns the bytes of a cloud up to its width, and from there to its row's size."""
+    message = matches_to_ros(PointMatches(0.0, 0.0, frame_id))
+    data = bytes(typestore().serialize_cdr(message, message.__msgtype__))
+    head = 12 + 4 + len(frame_id.encode()) + 1
+    width = head + -head % 4 + 4
+    end = len(data) - 1 - _POINT.itemsize - _LENGTHS.size
+    return data[:width], data[width + 4 : end]
+
+
+def _cloud(matches: PointMatches) -> NDArray[np.uint8]:
+    """Returns the points, (n, bytes of a point)."""
     age = nanoseconds(matches.stamp) - nanoseconds(matches.previous_stamp)
     require(
         0 <= age < 2**32,
@@ -40,26 +103,17 @@ def matches_to_ros(matches: PointMatches) -> Any:
         matches.previous_stamp,
         f"up to 4.29 s before {matches.stamp}",
     )
-    places = np.hstack([matches.current, matches.previous])
-    points = np.empty(max(len(places), 1), _POINT)
-    for name, column in zip(_PLACES, places.T, strict=True):
-        points[name] = column if len(places) else np.nan
+    n = len(matches.current)
+    points = np.empty(max(n, 1), _PLACED)
+    points["now"] = matches.current if n else math.nan
+    points["before"] = matches.previous if n else math.nan
     points[_AGE] = age
-    field = message_class("sensor_msgs/msg/PointField")
-    return message_class("sensor_msgs/msg/PointCloud2")(
-        header=header(matches.stamp, matches.frame_id),
-        height=1,
-        width=len(points),
-        fields=[
-            field(name, 8 * k, _NUMBERS[points[name].dtype.str[1:]], 1)
-            for k, name in enumerate((*_PLACES, _AGE))
-        ],
-        is_bigendian=False,
-        point_step=_POINT.itemsize,
-        row_step=points.nbytes,
-        data=points.view(np.uint8),
-        is_dense=bool(len(places) and np.isfinite(places).all()),
-    )
+    return points.view(np.uint8).reshape(len(points), -1)
+
+
+def _is_dense(matches: PointMatches) -> bool:
+    places = (matches.current, matches.previous)
+    return bool(len(matches.current) and all(np.isfinite(part).all() for part in places))
 
 
 def matches_from_ros(message: Any) -> PointMatches:

@@ -32,7 +32,7 @@ ENCODERS: Mapping[str, Encoder] = {
     "sensor_msgs/msg/CompressedImage": lambda v, _: ros_vision.image_to_ros(v),
     "sensor_msgs/msg/Imu": lambda v, t: ros_motion.imu_to_ros(v, stamp=t, frame_id="imu"),
     "sensor_msgs/msg/LaserScan": lambda v, _: ros_scan.scan_to_ros(v),
-    "sensor_msgs/msg/PointCloud2": lambda v, _: ros_flow.matches_to_ros(v),
+    "sensor_msgs/msg/PointCloud2": lambda v, _: ros_flow.serialised_matches(v),
 }
 
 DECODERS: Mapping[str, Decoder] = {

@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 # Where the elements of a position-first covariance stand in a rotation-first one, and the reverse.
 _SWAPPED = (6 * np.array([3, 4, 5, 0, 1, 2])[:, None] + [3, 4, 5, 0, 1, 2]).ravel()
+_FIELDS = np.concatenate([[4, 5, 6, 1, 2, 3, 0], 7 + _SWAPPED])  # of a pose's vector
 _PLANAR = np.ix_([0, 1, 5], [0, 1, 5])  # where x, y, theta stand in a position-first one
 _IDENTITY = np.eye(3).ravel()
 _NO_ORIENTATION = np.array([-1.0, 0, 0, 0, 0, 0, 0, 0, 0])  # as ROS says it
@@ -210,6 +211,17 @@ def planar_fields(pose: Array) -> tuple[float, float, float, float]:
     """
     x, y, theta = np.asarray(pose, float).tolist()
     return x, y, math.sin(theta / 2), math.cos(theta / 2)
+
+
+def pose_fields(vector: Array) -> Array:
+    """Returns the position (m), then x, y, z, w of the quaternion, of a pose's vector.
+
+    With a covariance after it, (43,), also that in ROS's order.
+
+    Args:
+        vector: (7,) as `systems.pose_vector` has it, or with 36 elements more, rotation first.
+    """
+    return vector.take(_FIELDS[: len(vector)])
 
 
 def pose_from_ros(message: Any) -> RigidTransform:

@@ -9,8 +9,9 @@ from diagrams import channels
 from diagrams.surroundings import clearance_signal
 from diagrams.teach_recording import odometry_signal
 from systems.angles import spatial_pose
-from systems.io.ros_motion import transforms_from_ros
+from systems.io.ros_motion import estimate_from_ros, transforms_from_ros
 from systems.io.ros_types import time_from_ros, typestore
+from systems.pose_vector import pose_to_vector
 
 SIGNALS = [
     channels.imu_signal("robot.imu", 100.0, 1e-4, 2e-3),
@@ -50,6 +51,23 @@ def test_inertial_samples_tell_their_variances():
     for name, variance in (("angular_velocity", 1e-6), ("linear_acceleration", 4e-4)):
         covariance = getattr(message, f"{name}_covariance").reshape(3, 3)
         np.testing.assert_allclose(covariance, variance * np.eye(3), rtol=1e-12)
+
+
+def test_a_pose_on_a_shell_survives_with_its_covariance():
+    rng = np.random.default_rng(1)
+    truth, estimate = (
+        channels.shell_truth_signal("robot"), channels.shell_estimate_signal("robot", 50.0)
+    )  # fmt: skip
+    for t in (0.0, 1527206460.125):
+        q = rng.normal(size=4) * [0, 1, 1, 1] + [3, 0, 0, 0]
+        value = np.concatenate([q / np.linalg.norm(q), rng.uniform(-0.1, 0.1, 3), rng.random(36)])
+        message = through_the_file(truth.encode, value[:7], t)
+        np.testing.assert_allclose(truth.decode(message), value[:7], rtol=0, atol=2e-15)
+        message = through_the_file(estimate.encode, value, t)
+        assert message.header.frame_id == "shell"
+        read = estimate_from_ros(message)
+        np.testing.assert_allclose(pose_to_vector(read.pose), value[:7], rtol=0, atol=2e-15)
+        np.testing.assert_array_equal(read.covariance.ravel(), value[7:])
 
 
 def test_planar_poses_become_frames_of_the_map():

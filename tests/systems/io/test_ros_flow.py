@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from systems.io.bag import BagReader, BagWriter
 from systems.io.playback import read_channel
-from systems.io.ros_flow import matches_from_ros, matches_to_ros
+from systems.io.ros_flow import matches_from_ros, matches_to_ros, serialised_matches
 from systems.io.ros_messages import decoder, encoder
 from systems.io.ros_types import typestore
 from systems.messages import PointMatches, whole_nanoseconds
@@ -149,6 +149,8 @@ def test_other_clouds_are_refused() -> None:
 def test_what_cannot_be_written_is_refused(stamps: tuple[float, float], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         matches_to_ros(PointMatches(*stamps))
+    with pytest.raises(ValueError, match=said):
+        serialised_matches(PointMatches(*stamps))
 
 
 def record(path: Path, *, start: float = 0.0) -> list[PointMatches]:
@@ -185,3 +187,15 @@ def test_what_is_played_back_is_what_was_recorded(tmp_path: Path, start: float) 
         assert played.previous_stamp == whole_nanoseconds(matches.previous_stamp - start)
         assert played.current.tobytes() == matches.current.tobytes()
     assert decoder(CLOUD) is matches_from_ros
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 7])
+def test_the_bytes_are_those_of_rosbags(n: int) -> None:
+    whole = some(n, start=1_700_000_000.0)
+    torn = dataclasses.replace(whole, current=np.where(whole.current < 200, np.nan, whole.current))
+    for length in range(9):  # of the frame's name: it moves all that follows
+        for matches in (whole, torn):
+            named = dataclasses.replace(matches, frame_id="ä" + "x" * length)
+            written = serialised_matches(named)
+            assert written.__msgtype__ == CLOUD
+            assert written.data == bytes(typestore().serialize_cdr(matches_to_ros(named), CLOUD))
