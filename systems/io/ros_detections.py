@@ -28,11 +28,12 @@ def serialised_detections(detections: Detections) -> SerialisedMessage:
         ValueError: a stamp or an id that ROS cannot keep.
     """
     n = len(detections)
-    H = homographies(detections.corners)
     numbers = np.empty((n, 19))
-    numbers[:, :2] = H[:, :2, 2]  # the centre
-    numbers[:, 2:10] = detections.corners[:, ::-1].reshape(n, 8)
-    numbers[:, 10:] = H.reshape(n, 9)
+    if n:
+        H = homographies(detections.corners)
+        numbers[:, :2] = H[:, :2, 2]  # the centre
+        numbers[:, 2:10] = detections.corners[:, ::-1].reshape(n, 8)
+        numbers[:, 10:] = H.reshape(n, 9)
     codes = zip(
         detections.ids.tolist(),
         detections.hamming.tolist(),
