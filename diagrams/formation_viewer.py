@@ -20,6 +20,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem
 
 from diagrams.surroundings_viewer import along
 from diagrams.viewer import ellipse
+from systems.periods import period
 from systems.planners.formation_course import FormationMove
 from systems.planners.formation_turns import RECORD_SIZE
 from systems.validation import require, require_positive
@@ -176,7 +177,7 @@ class FormationViewer(LeafSystem):
         self._draw_destination(place)
         for light, key, value in _LIGHTS:
             meshcat.SetProperty(f"/Lights/{light}/<object>", key, value)
-        self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
+        self.DeclarePeriodicPublishEvent(period(rate), 0.0, self._draw)
 
     def move_input_port(self) -> InputPort:
         """Returns the port of the present move."""

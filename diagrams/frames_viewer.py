@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem
 from systems.angles import spatial_pose
 from systems.mapping.tag_frames import TagFrame
 from systems.markers.layout import MarkerMap
+from systems.periods import period
 from systems.planners.closed_curve import ClosedCurve
 from systems.validation import require, require_positive
 
@@ -112,7 +113,7 @@ class FramesViewer(LeafSystem):
         cameras = {"true": Sphere(0.014), "observed": Box(0.022, 0.022, 0.022)}
         for kind, middle in cameras.items():
             add_triad(meshcat, f"{_ROOT}/{kind}/camera", length=0.12, radius=0.005, middle=middle)
-        self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
+        self.DeclarePeriodicPublishEvent(period(rate), 0.0, self._draw)
 
     def frame_input_port(self) -> InputPort:
         """Returns the port of what the camera sees."""

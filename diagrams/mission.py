@@ -28,6 +28,7 @@ from diagrams.station import RobotParameters, Station
 from diagrams.world import World
 from systems.io.bag import BagReader, BagWriter
 from systems.io.recorder import Recorder
+from systems.periods import period
 from systems.validation import nearest
 
 Array = NDArray[np.float64]
@@ -78,7 +79,7 @@ class Wiring:
         self._watched: dict[str, OutputPort] = {}  # to look one up by name takes a millisecond
         if meshcat is not None:
             parameters = MeshcatVisualizerParams(
-                publish_period=1 / frame_rate, role=Role.kIllustration, prefix="scene"
+                publish_period=period(frame_rate), role=Role.kIllustration, prefix="scene"
             )
             visualizer = MeshcatVisualizer(meshcat, parameters)
             visualizer.set_name("meshcat")
@@ -153,7 +154,7 @@ class Wiring:
 
     def log(self, name: str, rate: float = LOG_RATE) -> None:
         """Logs a vector output at `rate` (Hz)."""
-        self._logs[name] = LogVectorOutput(self.output(name), self.builder, 1 / rate)
+        self._logs[name] = LogVectorOutput(self.output(name), self.builder, period(rate))
         self._logs[name].set_name(f"log of {name}")
 
     def record(self, source: str, signal: Signal) -> None:

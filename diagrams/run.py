@@ -19,6 +19,7 @@ from diagrams.mission import FRAME_RATE, Mission
 from diagrams.report import finite
 from diagrams.scenario import Scenario, save_scenario
 from systems.compiled import prepare
+from systems.periods import period
 from systems.validation import require_non_negative
 
 # Of a run; a team's other robots have theirs with their names.
@@ -45,7 +46,8 @@ RESULTS = (
 
 # s, of the integrator; only kinematic twins have continuous state. Steps end at every event, and at
 # 0.3 m/s and 1 rad/s the longest is 3 micrometres wrong.
-_MAX_STEP = 0.05
+_MAX_STEP = 0.051
+_LOOKS = 10.0  # Hz, at the outcome
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def simulate(
         "scenario": scenario.name,
         "seed": scenario.seed,
         "outcome": outcome,
-        "sim_seconds": context.get_time(),
+        "sim_seconds": round(context.get_time(), 9),
         "wall_seconds": wall,
         "real_time_factor": context.get_time() / wall,
         "metrics": mission.metrics(context),
@@ -151,7 +153,7 @@ def _advance(
     simulator.Initialize()
     started = time.perf_counter()
     outcome = None
-    step = 0.1  # s between two looks at the outcome
+    step = period(_LOOKS)
     k = 0
     while outcome is None and context.get_time() < end:
         k += 1

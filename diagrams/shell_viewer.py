@@ -19,6 +19,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem
 from diagrams.viewer import ellipse
 from plants.shell import ShellParameters
 from plants.snailbot import SnailBotParameters, wheel_centres
+from systems.periods import period
 from systems.validation import require_positive
 
 Array = NDArray[np.float64]
@@ -125,7 +126,7 @@ class ShellViewer(LeafSystem):
         self._draw_ghost(body, shell)
         self._draw_covariance(body)
         meshcat.SetProperty(f"{self._root}/estimate", "visible", False, 0.0)
-        self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
+        self.DeclarePeriodicPublishEvent(period(rate), 0.0, self._draw)
 
     def pose_input_port(self) -> InputPort:
         """Returns the port of the estimated pose."""

@@ -33,6 +33,7 @@ from plants.lighting import daylight
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.layout import MarkerMap
 from systems.markers.projector import PlacedMarker
+from systems.periods import period
 from systems.sensors.faults import Fault, FaultInjector
 from systems.validation import nearest, require
 
@@ -252,7 +253,7 @@ class StationBuilder:
 
     def __post_init__(self) -> None:
         config = MultibodyPlantConfig(
-            time_step=self.time_step,
+            time_step=period(1 / self.time_step),
             discrete_contact_approximation="lagged",
             # Sampled ports make each step an unrestricted update, which copies all abstract state.
             use_sampled_output_ports=False,
@@ -261,7 +262,7 @@ class StationBuilder:
             self.plant, self.scene_graph = AddMultibodyPlant(config, self.builder)
         else:
             self.scene_graph = self.builder.AddSystem(SceneGraph())
-            self.plant = MultibodyPlant(self.time_step)
+            self.plant = MultibodyPlant(config.time_step)
             self.plant.RegisterAsSourceForSceneGraph(self.scene_graph)
         self.plant.set_name("plant")
         self.scene_graph.set_name("scene_graph")

@@ -17,6 +17,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem
 
 from systems.angles import spatial_pose, wrap
 from systems.messages import AvoiderState, OccupancyGrid, Path, Scan
+from systems.periods import period
 from systems.scans import hits, scan_points
 
 Array = NDArray[np.float64]
@@ -163,7 +164,7 @@ class SurroundingsViewer(LeafSystem):
         self._drawn = dict.fromkeys(inputs, math.nan)
         self._tiles: dict[tuple[int, int], bool] = {}
         self._draw_pointer()
-        self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
+        self.DeclarePeriodicPublishEvent(period(rate), 0.0, self._draw)
 
     def pose_input_port(self) -> InputPort:
         """Returns the port of the estimated pose."""

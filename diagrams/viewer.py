@@ -15,6 +15,7 @@ from pydrake.math import RigidTransform, RollPitchYaw
 from pydrake.systems.framework import Context, InputPort, LeafSystem
 
 from systems.angles import spatial_pose
+from systems.periods import period
 
 Array = NDArray[np.float64]
 
@@ -126,7 +127,7 @@ class EstimateViewer(LeafSystem):
         self._draw_ghost(ghost)
         self._draw_waypoints(waypoints, radius)
         meshcat.SetObject(f"{_ROOT}/ellipse/disc", Cylinder(1.0, 0.002), Rgba(1.0, 0.85, 0.1, 0.9))
-        self.DeclarePeriodicPublishEvent(1.0 / rate, 0.0, self._draw)
+        self.DeclarePeriodicPublishEvent(period(rate), 0.0, self._draw)
 
     def pose_input_port(self) -> InputPort:
         """Returns the port of the estimated pose."""

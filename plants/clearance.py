@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from plants.planar_shapes import PlanarShapes
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -112,7 +113,7 @@ class ClearanceMonitor(LeafSystem):
             "contacts", 1, self._calc_contacts, {self.discrete_state_ticket(self._state)}
         )
         if count > 0:
-            self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+            self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look)
 
     def pose_input_port(self) -> InputPort:
         """Returns the port of the robot's pose."""

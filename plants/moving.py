@@ -28,6 +28,7 @@ from pydrake.systems.framework import (
 
 from plants.obstacles import CylinderObstacle, require_point
 from plants.planar_shapes import PlanarShapes
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -161,7 +162,7 @@ class MovingObstacles(LeafSystem):
         self._waited = self.DeclareDiscreteState(np.zeros(n))
         self._since = self.DeclareDiscreteState(np.full(n, np.nan))
         if robots and any(cylinder.courtesy > 0 for cylinder in cylinders):
-            self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+            self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look)
         depends_on = {self.time_ticket(), self.xd_ticket()}
         self._positions_output = self.DeclareVectorOutputPort(
             "positions", 2 * n, self._calc_positions, depends_on

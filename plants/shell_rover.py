@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.health import Counts
 from systems.markers.pnp import rotation_from_vector
+from systems.periods import period
 from systems.shell.angles import nearest_rotation, rotation
 from systems.validation import require, require_non_negative, require_positive
 
@@ -83,7 +84,7 @@ class ShellRover(LeafSystem):
         )
         self._radius = radius
         self._height = height
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._R = self.DeclareDiscreteState(rotation(np.array(initial_angles)).ravel())
         self.DeclarePeriodicDiscreteUpdateEvent(self._dt, 0.0, self._step)

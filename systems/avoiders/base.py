@@ -22,6 +22,7 @@ from systems.avoiders.surroundings import (
 )
 from systems.health import Counts
 from systems.messages import AvoiderState, Scan
+from systems.periods import period
 from systems.pose_trail import empty_trail
 from systems.scans import SCAN_FAULTS, scan_fault
 from systems.validation import require, require_positive
@@ -216,7 +217,7 @@ class Avoider(LeafSystem):
         )
         self._hull = Hull(*(float(side) for side in sides))
         self._limits = parameters
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._pose_input = self.DeclareVectorInputPort("pose", 3)
         self._goal_input = self.DeclareVectorInputPort("goal", 2)
         self._scan_input = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))

@@ -21,6 +21,7 @@ from systems.compiled import compiled, packed
 from systems.controllers.braking import CollisionMonitorParameters, as_arrays, mark_safe
 from systems.health import Counts
 from systems.messages import Scan
+from systems.periods import period
 from systems.pose_trail import empty_trail, ray_ends, ray_poses, remember
 from systems.scans import SCAN_FAULTS, hits, scan_fault
 from systems.validation import require, require_positive
@@ -202,7 +203,7 @@ class CollisionMonitor(LeafSystem):
         self._hull = np.array(hull, float)
         self._lidar_pose = np.array(lidar_pose, float)
         self._parameters = parameters or CollisionMonitorParameters()
-        self._period = 1.0 / rate
+        self._period = period(rate)
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._scan_input = self.DeclareAbstractInputPort("scan", AbstractValue.Make(Scan()))
         self._sent_input = self.DeclareVectorInputPort("sent", 2)

@@ -11,6 +11,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.messages import Detections
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 
@@ -69,7 +70,7 @@ class FormationCameras(LeafSystem):
         self._stamps = self.DeclareDiscreteState(np.full(len(names), -math.inf))
         self._rested = self.DeclareDiscreteState(np.full(len(names), -math.inf))
         self._active = self.DeclareDiscreteState(np.ones(len(names)))
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._update)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._update)
         self._active_outputs = [
             self.DeclareVectorOutputPort(
                 f"{name}_active",

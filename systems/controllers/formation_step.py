@@ -26,6 +26,7 @@ from systems.controllers.step_task import OFF, STATUS_SIZE, Status, StepTask
 from systems.formation.axes import SIDES
 from systems.health import Counts
 from systems.messages import Detections
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -126,7 +127,7 @@ class FormationStep(LeafSystem):
         require_positive(rate=rate)
         self._cameras = (front_camera, rear_camera)
         self._step_parameters = step or FormationStepParameters()
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         nothing = AbstractValue.Make(Detections())
         self._view_inputs = (
             self.DeclareAbstractInputPort("front_detections", nothing),

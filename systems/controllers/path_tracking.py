@@ -21,6 +21,7 @@ from systems.angles import wrap
 from systems.estimators.planar_kalman import UNKNOWN
 from systems.health import Counts
 from systems.messages import Message
+from systems.periods import period
 from systems.planners.route import Place, Route
 from systems.validation import require, require_non_negative, require_positive
 
@@ -236,7 +237,7 @@ class PathTracker(LeafSystem):
         require(laps > 0, "laps", laps, "greater than 0")
         self._route = route
         self._limits = parameters
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._laps = laps
         self._pose_input = self.DeclareVectorInputPort("pose", 3)
         self._covariance_input = self.DeclareVectorInputPort("covariance", 9)

@@ -19,6 +19,7 @@ from systems.controllers.path_tracking import TrackingState
 from systems.estimators.planar_kalman import UNKNOWN
 from systems.health import Counts
 from systems.messages import Health, Message
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -285,7 +286,7 @@ class ReplaySupervisor(LeafSystem):
         self._memory = self.DeclareDiscreteState(list(Memory()))
         # Time, status, scale, age of the last sight, radius, free way.
         self._verdict = self.DeclareDiscreteState([math.nan, 0.0, 0.0, math.inf, math.inf, 0.0])
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, offset, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), offset, self._look)
         self._command_output = self.DeclareStateOutputPort("command", self._command)
         self._state_output = self.DeclareAbstractOutputPort(
             "state",

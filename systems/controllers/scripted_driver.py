@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.health import Counts
 from systems.noise import generator, stream_key
+from systems.periods import period
 from systems.planners.closed_curve import ClosedCurve
 from systems.validation import require_non_negative, require_positive
 
@@ -112,7 +113,7 @@ class ScriptedDriver(LeafSystem):
         self._command = self.DeclareDiscreteState(2)
         self._finished = self.DeclareDiscreteState(1)
         self._way = self.DeclareDiscreteState([math.nan])  # along the route so far, m
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / p.rate, 0.0, self._steer)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(p.rate), 0.0, self._steer)
         self._command_output = self.DeclareStateOutputPort("command", self._command)
         self._finished_output = self.DeclareStateOutputPort("finished", self._finished)
         self._counts = Counts(self, "bad_pose")

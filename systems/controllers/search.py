@@ -9,6 +9,7 @@ from typing import Any
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
+from systems.periods import period
 from systems.validation import require_non_negative, require_positive
 
 
@@ -61,7 +62,7 @@ class SearchWhenLost(LeafSystem):
         super().__init__()
         require_positive(rate=rate)
         self._parameters = parameters or SearchParameters()
-        self._period = 1.0 / rate
+        self._period = period(rate)
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._covariance_input = self.DeclareVectorInputPort("covariance", 9)
         self._duration = self.DeclareDiscreteState([self._period])  # of being lost, s

@@ -18,6 +18,7 @@ from pydrake.math import RigidTransform
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.angles import wrap
+from systems.periods import period
 from systems.shell.angles import rotation
 from systems.validation import require, require_non_negative, require_positive
 
@@ -207,7 +208,7 @@ class ShellRoute(LeafSystem):
             "pose", AbstractValue.Make(RigidTransform())
         )
         self._progress = self.DeclareDiscreteState([0.0, 0.0])
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._advance)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._advance)
         self._command_output = self.DeclareVectorOutputPort(
             "command",
             2,

@@ -10,6 +10,7 @@ from typing import Any
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 
@@ -87,7 +88,7 @@ class WheelDrive(LeafSystem):
         self._to_wheel_speeds = to_wheel_speeds
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._sent = self.DeclareDiscreteState(2)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / p.rate, 0.0, self._sample)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(p.rate), 0.0, self._sample)
         self._sent_output = self.DeclareStateOutputPort("sent", self._sent)
         ticket = {self.discrete_state_ticket(self._sent)}
         self._wheel_speeds_output = self.DeclareVectorOutputPort(

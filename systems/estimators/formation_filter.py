@@ -23,6 +23,7 @@ from systems.estimators.formation_filter_parameters import FormationFilterParame
 from systems.estimators.formation_model import measure
 from systems.health import Counts
 from systems.messages import Detections
+from systems.periods import period
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -123,7 +124,7 @@ class FormationFilter(LeafSystem):
         self._shapes = [array.shape for array in begin]
         self._states = [self.DeclareDiscreteState(array.ravel()) for array in begin]
         x, P, nis = self._states[0], self._states[1], self._states[-1]
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._step)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._step)
         size = 3 * self._robots
         self._poses_output = self.DeclareVectorOutputPort(
             "poses", size, self._calc_poses, {self.discrete_state_ticket(x)}

@@ -11,6 +11,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.angles import wrap
 from systems.health import Counts
+from systems.periods import period
 from systems.sensors.imu_parameters import GRAVITY
 from systems.validation import require, require_positive
 
@@ -64,7 +65,7 @@ class GyroYaw(LeafSystem):
         super().__init__()
         require_positive(rate=rate)
         require(num_samples >= 0, "num_samples", num_samples, "0 or greater")
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._num_samples = num_samples
         self._imu_input = self.DeclareVectorInputPort("imu", 6)
         # Sum and number of the samples that were averaged.

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
+from systems.periods import period
 from systems.sensors.imu_parameters import GRAVITY
 from systems.validation import require_non_negative, require_positive
 
@@ -162,7 +163,7 @@ class Madgwick(LeafSystem):
         require_positive(rate=rate)
         p = parameters or MadgwickParameters()
         self._parameters = p
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._imu_input = self.DeclareVectorInputPort("imu", 6)
         self._orientation = self.DeclareDiscreteState(list(IDENTITY))
         self._started = self.DeclareDiscreteState([float(not p.start_from_accelerometer)])

@@ -33,6 +33,7 @@ from systems.estimators.relocation import Agreement, refused
 from systems.health import Counts
 from systems.messages import PoseEstimate
 from systems.noise import sample_index
+from systems.periods import period
 from systems.validation import require_positive
 
 Array = NDArray[np.float64]
@@ -151,7 +152,7 @@ class PlanarEkf(LeafSystem):
         self._last_stamp = self.DeclareDiscreteState([np.nan])
         self._agreement = self.DeclareDiscreteState(Agreement.to_vector(None))
         self._nis = self.DeclareDiscreteState([np.nan, 0.0])
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._step)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._step)
         self._pose_output = self.DeclareVectorOutputPort(
             "pose", 3, self._calc_pose, {self.discrete_state_ticket(self._x)}
         )

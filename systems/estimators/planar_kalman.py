@@ -19,6 +19,7 @@ from systems.angles import planar_pose, wrap
 from systems.compiled import compiled, in_rows, packed
 from systems.health import Counts
 from systems.messages import PoseEstimate
+from systems.periods import period
 from systems.small_matrices import congruence
 from systems.validation import require, require_positive
 
@@ -211,7 +212,7 @@ class PlanarKalmanFilter(LeafSystem):
         super().__init__()
         require_positive(rate=rate)
         self._parameters = parameters or PlanarKalmanParameters()
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._command_input = self.DeclareVectorInputPort("command", 2)
         self._imu_input = self.DeclareVectorInputPort("imu", 6)
         nothing = AbstractValue.Make(PoseEstimate())

@@ -31,6 +31,7 @@ from systems.flow.shell import ShellView
 from systems.health import Counts
 from systems.markers.layout import MarkerMap
 from systems.messages import PoseEstimate, RotationIncrement
+from systems.periods import period
 from systems.shell.angles import angles_of, rotation
 from systems.small_matrices import folded, unfolded
 from systems.validation import require, require_non_negative, require_positive
@@ -146,7 +147,7 @@ class ShellEkf(LeafSystem):
         self._P = self.DeclareDiscreteState(folded(p.initial_covariance(len(markers))))
         self._memory = self.DeclareDiscreteState(self._fusion.new_memory())
         self._nis = self.DeclareDiscreteState([np.nan, 0.0])
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._step)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._step)
         ticket = {self.time_ticket(), self.xd_ticket()}
         self._pose_output = self.DeclareAbstractOutputPort(
             "pose", lambda: AbstractValue.Make(RigidTransform()), self._calc_pose, ticket

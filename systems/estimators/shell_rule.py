@@ -19,6 +19,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 from systems.health import Counts
 from systems.markers.pnp import cross_matrix, rotation_from_vector
 from systems.messages import PoseEstimate
+from systems.periods import period
 from systems.shell.angles import angles_of, nearest_rotation, rotation, rotation_vector
 from systems.validation import require, require_non_negative, require_positive
 
@@ -184,7 +185,7 @@ class ShellRule(LeafSystem):
         require_non_negative(height=height)
         self._parameters = p = parameters or ShellRuleParameters()
         self._radius = radius
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._marker_pose_input = self.DeclareAbstractInputPort(
             "marker_pose", AbstractValue.Make(PoseEstimate())
         )

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.angles import wrap
 from systems.health import Counts
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -167,7 +168,7 @@ class WheelOdometry(LeafSystem):
         self._pose = self.DeclareDiscreteState(3)
         self._covariance = self.DeclareDiscreteState(9)
         self._velocity = self.DeclareDiscreteState(2)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._read)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._read)
         self._pose_output = self.DeclareStateOutputPort("pose", self._pose)
         self._covariance_output = self.DeclareStateOutputPort("covariance", self._covariance)
         self._velocity_output = self.DeclareStateOutputPort("velocity", self._velocity)

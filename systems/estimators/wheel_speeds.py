@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
 from systems.health import Counts
+from systems.periods import period
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -58,7 +59,7 @@ class WheelSpeeds(LeafSystem):
         length = round(window * rate)
         require(length >= 1, "window", window, f"at least {1 / rate:g} s, from reading to reading")
         self._angle = 2 * math.pi / ticks_per_turn
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._most = max_speed / rate / self._angle  # ticks from reading to reading
         self._ticks_input = self.DeclareVectorInputPort("ticks", 2)
         # The readings of a window and one more, the latest last; NaN before the first.

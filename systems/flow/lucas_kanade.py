@@ -24,6 +24,7 @@ from systems.flow.shell import ShellView
 from systems.health import Counts
 from systems.markers.detector import is_picture
 from systems.messages import CameraImage, PointMatches, RotationIncrement
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -271,9 +272,9 @@ class PointTracker(LeafSystem):
         )
         self._counts = Counts(self, "bad_image", "bad_imu", "gap", "frozen", "no_points")
         self.DeclarePeriodicUnrestrictedUpdateEvent(
-            1.0 / rate, max(processing_time - _EARLY, 0.0), self._look
+            period(rate), max(processing_time - _EARLY, 0.0), self._look
         )
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / imu_rate, 0.0, self._remember)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(imu_rate), 0.0, self._remember)
 
     def image_input_port(self) -> InputPort:
         """Returns the port of the pictures."""

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 from systems.flow.shell import ShellView
 from systems.health import Counts
 from systems.messages import PointMatches
+from systems.periods import period
 from systems.validation import require_positive
 
 Array = NDArray[np.float64]
@@ -125,7 +126,7 @@ class MeanFlow(LeafSystem):
         )
         self._last_stamp = self.DeclareDiscreteState([math.nan])
         self._counts = Counts(self, "bad_imu", "bad_point", "no_flow")
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._count)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._count)
 
     def matches_input_port(self) -> InputPort:
         """Returns the port of the matches."""

@@ -23,6 +23,7 @@ from systems.health import Counts
 from systems.memo import Memo
 from systems.messages import PointMatches, RotationIncrement
 from systems.noise import generator, stream_key
+from systems.periods import period
 from systems.shell.angles import rotation_vector
 from systems.validation import require, require_non_negative, require_positive
 
@@ -250,7 +251,7 @@ class SphereFlow(LeafSystem):
         )
         self._last_stamp = self.DeclareDiscreteState([math.nan])
         self._counts = Counts(self, *REASONS)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._count)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._count)
 
     def matches_input_port(self) -> InputPort:
         """Returns the port of the matches."""

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 from pydrake.systems.framework import Context, DiscreteValues, LeafSystem, OutputPort
 
+from systems.periods import period
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -114,7 +115,7 @@ class MeshcatDriver(LeafSystem):
         self._finished = self.DeclareDiscreteState(1)
         # Clicks of `straight on`, `stop` and `done` that were heard; whether the pad's Y is down.
         self._heard = self.DeclareDiscreteState(4)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / p.rate, 0.0, self._listen)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(p.rate), 0.0, self._listen)
         self._command_output = self.DeclareStateOutputPort("command", self._command)
         self._finished_output = self.DeclareStateOutputPort("finished", self._finished)
 

@@ -18,6 +18,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 from systems.io.bag import BagWriter
 from systems.io.ros_messages import Encoder, encoder
 from systems.io.ros_types import typestore
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 _log = logging.getLogger(__name__)
@@ -202,7 +203,7 @@ class Recorder(LeafSystem):
             _make_serialiser(channel, encode)
         self.DeclareInitializationPublishEvent(self._record_static)
         for rate, group in groups.items():
-            self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, partial(self._record, group))
+            self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, partial(self._record, group))
 
     @property
     def lost(self) -> int:

@@ -30,6 +30,7 @@ from systems.markers.planar_pose import planar_poses
 from systems.markers.pnp import cross_matrix
 from systems.memo import Memo
 from systems.messages import Detections, Message, PoseEstimate
+from systems.periods import period
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -285,8 +286,8 @@ class TagFrames(LeafSystem):
         # One event adds to the history and one counts, each by the stamp of what it saw last:
         # Drake does unrestricted updates before discrete ones.
         self._last_stamp = self.DeclareDiscreteState([math.nan])
-        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._remember)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._count)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period(rate), 0.0, self._remember)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._count)
 
     def detections_input_port(self) -> InputPort:
         """Returns the port of the detections."""

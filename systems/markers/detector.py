@@ -28,6 +28,7 @@ from systems.markers.family import Family
 from systems.markers.family import family as family_by_name
 from systems.memo import Memo
 from systems.messages import CameraImage, Detections
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -325,7 +326,7 @@ class Detector(LeafSystem):
         )
         self._last_stamp = self.DeclareDiscreteState([math.nan])
         self._counts = Counts(self, "bad_image")
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._count)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._count)
 
     def image_input_port(self) -> InputPort:
         """Returns the port of the pictures."""

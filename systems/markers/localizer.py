@@ -26,6 +26,7 @@ from systems.markers.pnp import (
 from systems.markers.sifting import sift
 from systems.memo import Memo
 from systems.messages import Detections, PoseEstimate
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -406,7 +407,7 @@ class Localizer(LeafSystem):
         )
         self._last_stamp = self.DeclareDiscreteState([np.nan])
         self._counts = Counts(self, *REASONS)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._count)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._count)
 
     def detections_input_port(self) -> InputPort:
         """Returns the port of the detections."""

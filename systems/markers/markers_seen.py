@@ -9,6 +9,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.markers.layout import MarkerMap
 from systems.messages import Detections
+from systems.periods import period
 from systems.validation import require_positive
 
 
@@ -50,7 +51,7 @@ class MarkersSeen(LeafSystem):
         # Whether enough are in view, how many were met, share; then stamp, pictures, with enough.
         self._seen = self.DeclareDiscreteState([0.0, 0.0, 0.0])
         self._pictures = self.DeclareDiscreteState([math.nan, 0.0, 0.0])
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look)
         self._seen_output = self.DeclareStateOutputPort("seen", self._seen)
 
     def detections_input_port(self) -> InputPort:

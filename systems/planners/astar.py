@@ -17,6 +17,7 @@ from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSyste
 
 from systems.health import Counts
 from systems.messages import OccupancyGrid, Path
+from systems.periods import period
 from systems.planners.cost_map import (
     CostMap,
     cost_map,
@@ -223,7 +224,7 @@ class AStarPlanner(LeafSystem):
         # when no plan has got there.
         self._memory = self.DeclareDiscreteState(np.full(5, math.nan))
         self._path = self.DeclareAbstractState(AbstractValue.Make(Path(frame_id="map")))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period(rate), 0.0, self._look)
         self._goal_output = self.DeclareStateOutputPort("goal", self._steer)
         self._path_output = self.DeclareStateOutputPort("path", self._path)
         self._reachable_output = self.DeclareStateOutputPort("reachable", self._reachable)

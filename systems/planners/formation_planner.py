@@ -11,6 +11,7 @@ from pydrake.common.value import AbstractValue
 from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSystem, OutputPort, State
 
 from systems.health import Counts
+from systems.periods import period
 from systems.planners.formation_astar import astar_move
 from systems.planners.formation_course import FormationMove, Memory, Report, Rule, after
 from systems.planners.formation_ground import FormationParameters
@@ -106,7 +107,7 @@ class FormationPlanner(LeafSystem):
         self._progress_input = self.DeclareVectorInputPort("progress", 2)
         first = Memory(dict(enumerate(vertices)), FormationMove(frame_id="map"))
         self._memory = self.DeclareAbstractState(AbstractValue.Make(first))
-        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period(rate), 0.0, self._look)
         self._move_output = self.DeclareAbstractOutputPort(
             "move",
             lambda: AbstractValue.Make(FormationMove()),

@@ -24,6 +24,7 @@ from pydrake.systems.framework import (
 from systems.controllers.step_task import OFF, STATUS_SIZE, Status, StepTask
 from systems.formation.triangles import arrival_heading
 from systems.health import Counts
+from systems.periods import period
 from systems.planners.formation_course import FormationMove
 from systems.planners.formation_tasks import not_found, task_of, way_length
 from systems.validation import require, require_non_negative, require_positive
@@ -170,7 +171,7 @@ class FormationTurns(LeafSystem):
         self._astray = self.DeclareDiscreteState(n)
         self._task = self.DeclareAbstractState(AbstractValue.Make(OFF))
         self._record = self.DeclareDiscreteState(RECORD_SIZE)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._update)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period(rate), 0.0, self._update)
         turn = {self.discrete_state_ticket(self._turn)}
         both = turn | {self.abstract_state_ticket(self._task)}
         self._task_outputs = [

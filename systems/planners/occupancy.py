@@ -20,6 +20,7 @@ from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSyste
 from systems.compiled import compiled, in_rows, packed
 from systems.health import Counts
 from systems.messages import OccupancyGrid, Scan
+from systems.periods import period
 from systems.pose_trail import empty_trail, poses_at, ray_poses, remember
 from systems.scans import scan_fault
 from systems.validation import require, require_positive
@@ -326,7 +327,7 @@ class OccupancyMapper(LeafSystem):
         self._last_stamp = self.DeclareDiscreteState([math.nan])
         nothing = AbstractValue.Make(empty_grid(self._parameters))
         self._grid = self.DeclareAbstractState(nothing)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period(rate), 0.0, self._look)
         self._grid_output = self.DeclareStateOutputPort("grid", self._grid)
         self._counts = Counts(self, *REASONS)
 

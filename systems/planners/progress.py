@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.health import Counts
 from systems.messages import Path
+from systems.periods import period
 from systems.planners.polyline import length_of, rest_of
 from systems.validation import require_non_negative, require_positive
 
@@ -98,7 +99,7 @@ class ProgressMonitor(LeafSystem):
         # The waypoint, the least that was left to go to it, when that was, and the most since.
         self._best = self.DeclareDiscreteState(np.full(5, math.nan))
         self._stuck = self.DeclareDiscreteState(1)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look)
         self._stuck_output = self.DeclareStateOutputPort("stuck", self._stuck)
         self._counts = Counts(self, "bad_pose", "bad_goal", "bad_path")
 

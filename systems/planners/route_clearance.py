@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 from systems.controllers.path_tracking import TrackingState
 from systems.health import Counts
 from systems.messages import Scan
+from systems.periods import period
 from systems.planners.route import Route
 from systems.scans import SCAN_FAULTS, scan_fault, scan_points
 from systems.validation import require, require_non_negative, require_positive
@@ -131,7 +132,7 @@ class RouteClearance(LeafSystem):
             "tracking", AbstractValue.Make(TrackingState())
         )
         self._free = self.DeclareDiscreteState([math.nan])
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look)
         self._free_output = self.DeclareStateOutputPort("free_distance", self._free)
         self._counts = Counts(self, *SCAN_FAULTS, "bad_pose")
 

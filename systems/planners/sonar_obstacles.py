@@ -16,6 +16,7 @@ from pydrake.systems.framework import Context, EventStatus, InputPort, LeafSyste
 from systems.angles import wrap
 from systems.health import Counts
 from systems.messages import Message, Scan
+from systems.periods import period
 from systems.planners.formation_obstacles import Obstacles
 from systems.planners.sonar_grid import (
     Cones,
@@ -236,7 +237,7 @@ class SonarObstacles(LeafSystem):
         self._ring = RingGeometry(np.array(ring_pose, float), offset, half_angle)
         self._parameters = parameters or SonarGridParameters()
         self._trust = trust or SonarTrustParameters()
-        self._dt = 1.0 / rate
+        self._dt = period(rate)
         self._robots = robots
         self._poses_input = self.DeclareVectorInputPort("poses", 3 * robots)
         self._covariance_input = self.DeclareVectorInputPort("covariance", 9 * robots**2)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
+from systems.periods import period
 from systems.validation import require, require_positive
 
 
@@ -57,7 +58,7 @@ class WaypointSequencer(LeafSystem):
         self._radius = radius
         self._pose_input = self.DeclareVectorInputPort("pose", 3)
         self._reached = self.DeclareDiscreteState(1)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look_at_arrival)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look_at_arrival)
         ticket = {self.discrete_state_ticket(self._reached)}
         self._goal_output = self.DeclareVectorOutputPort("goal", 2, self._calc_goal, ticket)
         self._reached_output = self.DeclareStateOutputPort("waypoints_reached", self._reached)

@@ -14,6 +14,7 @@ from pydrake.systems.framework import Context, InputPort, LeafSystem, OutputPort
 
 from systems.messages import CameraImage, Detections, PointMatches, Scan
 from systems.noise import NoiseStream, sample_index
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 Array = NDArray[np.float64]
@@ -184,7 +185,7 @@ class FaultInjector(LeafSystem):
                 lambda: AbstractValue.Make(model),
                 lambda context, output: output.set_value(self._calc(context)),
             )
-        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / _RATE, 0.0, self._remember)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period(_RATE), 0.0, self._remember)
 
     def input_port(self) -> InputPort:
         """Returns the port of the signal."""

@@ -12,6 +12,7 @@ from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSy
 
 from systems.compiled import compiled, packed
 from systems.noise import NoiseStream, sample_index
+from systems.periods import period
 from systems.sensors.imu_parameters import GRAVITY, ImuParameters
 from systems.validation import require, require_positive
 
@@ -242,7 +243,7 @@ class Imu(LeafSystem):
         bias = [*p.gyro_bias, *p.accel_bias]
         self._piece = self.DeclareDiscreteState(np.r_[np.eye(6).ravel(), bias, np.zeros(18)])
         self.DeclareInitializationDiscreteUpdateEvent(self._switch_on)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._measure)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._measure)
         self._sample_output = self.DeclareStateOutputPort("sample", self._sample)
 
     def pose_input_port(self) -> InputPort:

@@ -15,6 +15,7 @@ from systems.health import Counts
 from systems.memo import Memo
 from systems.messages import Detections
 from systems.noise import NoiseStream
+from systems.periods import period
 from systems.validation import require, require_positive
 
 Array = NDArray[np.float64]
@@ -119,7 +120,7 @@ class MissedPassages(LeafSystem):
             {self._detections_input.ticket(), *reads},
         )
         self._counts = Counts(self, "missed", "missed_passages")
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look)
 
     def detections_input_port(self) -> InputPort:
         """Returns the port of what there is to be seen."""

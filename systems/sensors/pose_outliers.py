@@ -15,6 +15,7 @@ from systems.health import Counts
 from systems.markers.pnp import rotation_from_vector
 from systems.messages import PoseEstimate
 from systems.noise import NoiseStream, sample_index
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 
@@ -87,7 +88,7 @@ class PoseOutliers(LeafSystem):
             {self._pose_input.ticket(), self.all_parameters_ticket()},
         )
         self._counts = Counts(self, "turned")
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._look)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._look)
 
     def pose_input_port(self) -> InputPort:
         """Returns the port of the poses as measured."""

@@ -19,6 +19,7 @@ from pydrake.systems.framework import (
 
 from systems.messages import Message, whole_nanoseconds
 from systems.noise import sample_index
+from systems.periods import period
 from systems.validation import require, require_non_negative, require_positive
 
 _ROUNDING = 1e-9  # s, by which the time at which somebody looks may be before that of an arrival
@@ -94,7 +95,7 @@ class SampledSensor(LeafSystem):
         self._nothing = nothing
         samples = self.DeclareAbstractState(AbstractValue.Make(_Samples()))
         self._samples = int(samples)
-        self.DeclarePeriodicUnrestrictedUpdateEvent(1.0 / rate, 0.0, self._take)
+        self.DeclarePeriodicUnrestrictedUpdateEvent(period(rate), 0.0, self._take)
         return self.DeclareAbstractOutputPort(
             name,
             lambda: AbstractValue.Make(nothing),

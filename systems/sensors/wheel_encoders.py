@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
 
+from systems.periods import period
 from systems.validation import require_positive
 
 Array = NDArray[np.float64]
@@ -66,7 +67,7 @@ class WheelEncoders(LeafSystem):
         self._ticks_per_turn = (parameters or WheelEncoderParameters()).ticks_per_turn
         self._angles_input = self.DeclareVectorInputPort("wheel_angles", 2)
         self._ticks = self.DeclareDiscreteState(2)
-        self.DeclarePeriodicDiscreteUpdateEvent(1.0 / rate, 0.0, self._read)
+        self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._read)
         self._ticks_output = self.DeclareStateOutputPort("ticks", self._ticks)
 
     def wheel_angles_input_port(self) -> InputPort:
