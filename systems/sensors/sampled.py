@@ -79,7 +79,7 @@ class SampledSensor(LeafSystem):
 
         Returns:
             The output port. It changes only when a message arrives, though for Drake it depends
-            on the time.
+            on the time, unless they arrive at once.
 
         Raises:
             ValueError: rate, latency or clock_error out of range.
@@ -96,11 +96,10 @@ class SampledSensor(LeafSystem):
         samples = self.DeclareAbstractState(AbstractValue.Make(_Samples()))
         self._samples = int(samples)
         self.DeclarePeriodicUnrestrictedUpdateEvent(period(rate), 0.0, self._take)
+        # What depends on the time is made anew for whoever asks at each step.
+        told = {self.abstract_state_ticket(samples)} | ({self.time_ticket()} if latency else set())
         return self.DeclareAbstractOutputPort(
-            name,
-            lambda: AbstractValue.Make(nothing),
-            self._calc_arrived,
-            {self.abstract_state_ticket(samples), self.time_ticket()},
+            name, lambda: AbstractValue.Make(nothing), self._calc_arrived, told
         )
 
     @abstractmethod
