@@ -253,12 +253,14 @@ class Mission:
         station: its station.
         recorder: what writes the recording, if anything does.
         logs: vector logs by the name of the port.
+        aligned: whether its blocks were made within `systems.periods.aligned`.
     """
 
     diagram: Diagram
     station: Station
     recorder: Recorder | None
     logs: dict[str, VectorLogSink]
+    aligned: bool = False
 
     @abstractmethod
     def outcome(self, context: Context) -> str | None:

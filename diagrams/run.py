@@ -19,7 +19,7 @@ from diagrams.mission import FRAME_RATE, Mission
 from diagrams.report import finite
 from diagrams.scenario import Scenario, save_scenario
 from systems.compiled import prepare
-from systems.periods import period
+from systems.periods import align, aligned
 from systems.validation import require_non_negative
 
 # Of a run; a team's other robots have theirs with their names.
@@ -46,8 +46,7 @@ RESULTS = (
 
 # s, of the integrator; only kinematic twins have continuous state. Steps end at every event, and at
 # 0.3 m/s and 1 rad/s the longest is 3 micrometres wrong.
-_MAX_STEP = 0.051
-_LOOKS = 10.0  # Hz, at the outcome
+_MAX_STEP = 0.05
 
 
 @dataclass(frozen=True)
@@ -114,7 +113,7 @@ def simulate(
         "scenario": scenario.name,
         "seed": scenario.seed,
         "outcome": outcome,
-        "sim_seconds": round(context.get_time(), 9),
+        "sim_seconds": context.get_time(),
         "wall_seconds": wall,
         "real_time_factor": context.get_time() / wall,
         "metrics": mission.metrics(context),
@@ -149,21 +148,22 @@ def _advance(
     ApplySimulatorConfig(config, simulator)
     simulator.set_target_realtime_rate(realtime)
     context = simulator.get_mutable_context()
-    end = min(scenario.time_limit, mission.station.end_time)
+    with aligned(mission.aligned):
+        look = align(0.1)  # s between two looks at the outcome
+        end = align(min(scenario.time_limit, mission.station.end_time))
     simulator.Initialize()
     started = time.perf_counter()
     outcome = None
-    step = period(_LOOKS)
     k = 0
     while outcome is None and context.get_time() < end:
         k += 1
-        simulator.AdvanceTo(min(k * step, end))
+        simulator.AdvanceTo(min(k * look, end))
         outcome = mission.outcome(context)
         if progress is not None:
             progress(context.get_time(), end)
     wall = time.perf_counter() - started
     if outcome is None:
-        word = "timeout" if end == scenario.time_limit else "played"
+        word = "played" if mission.station.end_time < scenario.time_limit else "timeout"
         outcome = mission.unfinished(context, word)
     return outcome, context, wall
 

@@ -36,9 +36,13 @@ _SLIDING = 0.2  # s, that a margin below 1 has to last
 class ShellMission(Mission):
     """The wired diagram of a `SnailBotScenario`.
 
+    It is to be made within `aligned`: it has cameras at 60 Hz and inertial sensors at 300.
+
     Attributes:
         robots: the team, in its order.
     """
+
+    aligned = True
 
     def __init__(
         self, scenario: SnailBotScenario, *, meshcat: Meshcat | None, out: Path | None

@@ -29,6 +29,7 @@ from systems.estimators.shell_ekf_parameters import ShellEkfParameters
 from systems.flow.sphere_flow import SphereFlowParameters
 from systems.markers.localizer import LocalizerParameters
 from systems.markers.pnp import rotation_from_vector
+from systems.periods import aligned
 from systems.validation import require
 
 ESTIMATORS = Table(
@@ -275,7 +276,8 @@ class SnailBotScenario(Scenario):
         Raises:
             ValueError: something of the scenario is refused; one line.
         """
-        return ShellMission(self, meshcat=meshcat, out=out)
+        with aligned():
+            return ShellMission(self, meshcat=meshcat, out=out)
 
 
 def closes(legs: list[Leg]) -> bool:

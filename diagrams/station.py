@@ -33,7 +33,7 @@ from plants.lighting import daylight
 from systems.io.ros_motion import FrameTransform, transforms_to_ros
 from systems.markers.layout import MarkerMap
 from systems.markers.projector import PlacedMarker
-from systems.periods import period
+from systems.periods import align
 from systems.sensors.faults import Fault, FaultInjector
 from systems.validation import nearest, require
 
@@ -253,7 +253,7 @@ class StationBuilder:
 
     def __post_init__(self) -> None:
         config = MultibodyPlantConfig(
-            time_step=period(1 / self.time_step),
+            time_step=align(self.time_step),
             discrete_contact_approximation="lagged",
             # Sampled ports make each step an unrestricted update, which copies all abstract state.
             use_sampled_output_ports=False,
