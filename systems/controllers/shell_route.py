@@ -15,7 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydrake.common.value import AbstractValue
 from pydrake.math import RigidTransform
-from pydrake.systems.framework import Context, DiscreteValues, InputPort, LeafSystem, OutputPort
+from pydrake.systems.framework import (
+    Context,
+    DiscreteValues,
+    InputPort,
+    LeafSystem,
+    OutputPort,
+    ValueProducer,
+)
 
 from systems.angles import wrap
 from systems.periods import period
@@ -209,11 +216,13 @@ class ShellRoute(LeafSystem):
         )
         self._progress = self.DeclareDiscreteState([0.0, 0.0])
         self.DeclarePeriodicDiscreteUpdateEvent(period(rate), 0.0, self._advance)
-        self._command_output = self.DeclareVectorOutputPort(
-            "command",
-            2,
-            self._calc_command,
+        self._where = self.DeclareCacheEntry(
+            "where it is on its way",
+            ValueProducer(allocate=lambda: AbstractValue.Make([]), calc=self._calc_where),
             {self._pose_input.ticket(), self.discrete_state_ticket(self._progress)},
+        )
+        self._command_output = self.DeclareVectorOutputPort(
+            "command", 2, self._calc_command, {self._where.ticket()}
         )
         self._progress_output = self.DeclareStateOutputPort("progress", self._progress)
 
@@ -229,21 +238,22 @@ class ShellRoute(LeafSystem):
         """Returns the port of the leg and the angle along it."""
         return self._progress_output
 
-    def _where(self, context: Context) -> tuple[int, OnLeg, float] | None:
-        """Returns leg, place and the angle driven along it, which may exceed half a turn.
+    def _calc_where(self, context: Context, output: AbstractValue) -> None:
+        """Puts out leg, place and the angle driven along it, which may exceed half a turn.
 
-        None at the end of the route.
+        Nothing at the end of the route.
         """
         index, driven = context.get_discrete_state(self._progress).get_value().tolist()
         if index >= len(self._legs):
-            return None
+            output.set_value([])
+            return
         R_RB = self._pose_input.Eval(context).rotation().matrix()
         where = on_leg(R_RB, self._frames[int(index)])
-        return int(index), where, driven + wrap(where.along - driven)
+        output.set_value([int(index), where, driven + wrap(where.along - driven)])
 
     def _advance(self, context: Context, discrete_state: DiscreteValues) -> None:
-        now = self._where(context)
-        if now is None:
+        now = self._where.Eval(context)
+        if not now:
             return
         index, where, driven = now
         arc = self._legs[index].arc
@@ -254,8 +264,8 @@ class ShellRoute(LeafSystem):
         discrete_state.set_value(self._progress, [index + 1, 0.0] if reached else [index, driven])
 
     def _calc_command(self, context: Context, output: Any) -> None:
-        now = self._where(context)
-        if now is None:
+        now = self._where.Eval(context)
+        if not now:
             output.SetFromVector([0.0, 0.0])
             return
         index, where, driven = now

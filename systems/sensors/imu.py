@@ -78,13 +78,13 @@ def ideal_sample(X_WB: RigidTransform, V_WB: Array, A_WB: Array, p_BS: Array) ->
         upward.
     """
     sample = np.empty(6)
-    R_WB = packed(X_WB.rotation().matrix())
-    _ideal_sample(R_WB, packed(V_WB), packed(A_WB), packed(p_BS), sample)
+    _ideal_sample(packed(X_WB.GetAsMatrix34()), packed(V_WB), packed(A_WB), packed(p_BS), sample)
     return sample
 
 
 @compiled("void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1])")
 def _ideal_sample(R: Array, V: Array, A: Array, p: Array, sample: Array) -> None:
+    # R may have more columns: it is the pose (3, 4).
     for i in range(3):  # in B: angular velocity, specific force at B's origin
         sample[i] = R[0, i] * V[0] + R[1, i] * V[1] + R[2, i] * V[2]
         sample[3 + i] = R[0, i] * A[3] + R[1, i] * A[4] + R[2, i] * (A[5] + GRAVITY)
@@ -109,7 +109,7 @@ _MATRIX, _BIAS, _DRIFT, _VIBRATION = slice(36), slice(36, 42), slice(42, 48), sl
     "void(f8[:,::1], f8[::1], f8[::1], f8[::1], f8[::1], f8[:,::1], c16, f8[::1], i8, f8[::1])"
 )
 def _take_sample(
-    R: Array,
+    X: Array,
     V: Array,
     A: Array,
     p: Array,
@@ -123,7 +123,7 @@ def _take_sample(
     """Writes what the sensor tells, and carries its vibration and drift on to the next sample.
 
     Args:
-        R: (3, 3) as V (6,), A (6,) and p (3,) see `ideal_sample`.
+        X: (3, 4) as V (6,), A (6,) and p (3,) see `ideal_sample`.
         V: (6,).
         A: (6,).
         p: (3,).
@@ -137,7 +137,7 @@ def _take_sample(
         bits: see `ImuParameters`.
         sample: (6,), written.
     """
-    _ideal_sample(R, V, A, p, sample)
+    _ideal_sample(X, V, A, p, sample)
     matrix, bias = piece[_MATRIX].reshape(6, 6), piece[_BIAS]
     drift, vibration = piece[_DRIFT], piece[_VIBRATION]
     if len(noise) >= 18:
@@ -273,7 +273,7 @@ class Imu(LeafSystem):
     def _measure(self, context: Context, discrete_state: DiscreteValues) -> None:
         index = sample_index(context.get_time(), self._rate)
         _take_sample(
-            packed(self._pose_input.Eval(context).rotation().matrix()),
+            packed(self._pose_input.Eval(context).GetAsMatrix34()),
             packed(self._velocity_input.Eval(context)),
             packed(self._acceleration_input.Eval(context)),
             self._p_BS,
