@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from pydrake.systems.analysis import Simulator
 from scipy.spatial.transform import Rotation
 
 from diagrams.scenario import load_scenario
@@ -370,3 +371,11 @@ def test_the_routine_is_the_papers() -> None:
     assert legs == [over_the_pole, along_the_equator] * 5 + [[0, 0, 0, 0]]
     own = load_scenario("snailbot", [CLIMB]).team[0]
     assert [leg.arc for leg in own.legs(2)] == pytest.approx([math.pi / 3] * 2)
+
+
+def test_all_that_is_due_at_an_instant_is_one_step() -> None:
+    """The camera's 60 Hz, the recorder's and the logs' 50 fall on the plant's 300."""
+    mission = load_scenario("snailbot", {"sight": "projected"}).build()
+    simulator = Simulator(mission.diagram)
+    simulator.AdvanceTo(2.001)
+    assert simulator.get_num_steps_taken() == 601  # the last one to 2.001 s
