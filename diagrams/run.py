@@ -19,6 +19,7 @@ from diagrams.mission import FRAME_RATE, Mission
 from diagrams.report import finite
 from diagrams.scenario import Scenario, save_scenario
 from systems.compiled import prepare
+from systems.messages import whole_nanoseconds
 from systems.periods import align, aligned
 from systems.validation import require_non_negative
 
@@ -113,7 +114,7 @@ def simulate(
         "scenario": scenario.name,
         "seed": scenario.seed,
         "outcome": outcome,
-        "sim_seconds": context.get_time(),
+        "sim_seconds": whole_nanoseconds(context.get_time()),
         "wall_seconds": wall,
         "real_time_factor": context.get_time() / wall,
         "metrics": mission.metrics(context),
