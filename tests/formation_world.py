@@ -196,6 +196,7 @@ class FormationWorld:
         """Returns parameters that say how exact this world's sights are."""
         fitting: dict[str, object] = {
             "pixel_noise": max(self.corner_noise, 1e-3),
+            "corner_floor": 0.0,
             "bearing_floor": max(self.lasting[0], 1e-5),
             "range_floor": max(self.lasting[1], 1e-4),
             "start_position_noise": self.start_noise[0],

@@ -19,10 +19,12 @@ class FormationFilterParameters:
         marker_size: side of the black squares, m.
         marker_offset: from a robot's axis to the centres of its four markers, m.
         pixel_noise: white noise of a corner coordinate, px.
-        bearing_floor: what no mean over pictures takes away while two robots stand, rad: how well
-            markers and corners are where they are said to be. 0.02 degrees are 0.17 px at
-            485 px, or 0.5 mm at 1.5 m.
-        range_floor: the same of the distance, relatively.
+        corner_floor: what no mean over pictures takes away of it while two robots stand, px: how
+            pixels happen to fall on a marker. Without it distances of far markers, whose pixels
+            are few, would be trusted too much.
+        bearing_floor: the same of the bearing, rad: how well markers sit where they are said to.
+            0.02 degrees are 0.17 px at 485 px, or 0.5 mm at 1.5 m.
+        range_floor: the same of the distance, relatively: how large markers are.
         use_range: whether the distances count, beside the bearings.
         start_position_noise: standard deviation of each robot's x and y at the start, m.
         start_heading_noise: of its heading, rad.
@@ -41,6 +43,7 @@ class FormationFilterParameters:
     marker_size: float = 0.16
     marker_offset: float = 0.15
     pixel_noise: float = 0.3
+    corner_floor: float = 0.1
     bearing_floor: float = 0.00035
     range_floor: float = 0.003
     use_range: bool = True
@@ -61,12 +64,14 @@ class FormationFilterParameters:
             "track_rate",
         )  # fmt: skip
         require_positive(**{name: getattr(self, name) for name in above_zero})
-        zero_allowed = ("marker_offset", "pixel_noise", "yaw_error", "settle_time")
+        zero_allowed = (
+            "marker_offset", "pixel_noise", "corner_floor", "yaw_error", "settle_time",
+        )  # fmt: skip
         require_non_negative(**{name: getattr(self, name) for name in zero_allowed})
 
     def sighting_noise(self) -> NDArray[np.float64]:
         """Returns what `formation_model.variances` takes."""
-        return np.array([self.pixel_noise, self.bearing_floor, self.range_floor])
+        return np.array([self.pixel_noise, self.corner_floor, self.bearing_floor, self.range_floor])
 
     def start_deviations(self, robots: int, cameras: int) -> NDArray[np.float64]:
         """Returns the standard deviations of the state at the start, (robots (3 + cameras),)."""

@@ -177,15 +177,16 @@ def variances(
         frames: (n,) pictures that each is the mean of.
         focal_length: px.
         marker_size: m.
-        noise: (3,) white noise of a corner coordinate, px; and what no mean over pictures takes
-            away, in the bearing, rad, and in the distance, relatively.
+        noise: (4,) white noise of a corner coordinate, px; and what no mean over pictures takes
+            away: of that coordinate, px, in the bearing, rad, and in the distance, relatively.
     """
-    white, lasting = noise[0], noise[1:]
+    (white, lasting), floors = noise[:2], noise[2:]
     cosine = np.cos(values[:, 0])
     height = focal_length * marker_size / (np.exp(values[:, 1]) * cosine)
-    crossing = math.sqrt(1.5) * white / 2
-    by_picture = np.column_stack([crossing / focal_length * cosine**2, white / height])
-    return np.asarray(by_picture**2 / frames[:, None] + lasting**2)
+    crossing = math.sqrt(1.5) / 2 / focal_length * cosine**2
+    by_corner = np.column_stack([crossing, 1 / height])  # rad and relatively, for 1 px
+    corner = white**2 / frames + lasting**2
+    return np.asarray(by_corner**2 * corner[:, None] + floors**2)
 
 
 class SightingModel:

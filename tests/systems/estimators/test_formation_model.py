@@ -100,9 +100,8 @@ def test_corner_noise_gives_the_variances_that_are_promised() -> None:
     errors = np.array(
         [measure(world.detections(3, 1, 0.0), CAMERA, SIZE) - true for _ in range(2000)]
     )
-    said = variances(
-        true, np.ones(len(true)), focal_length=485.0, marker_size=SIZE, noise=np.array([0.5, 0, 0])
-    )
+    noise = np.array([0.5, 0, 0, 0])
+    said = variances(true, np.ones(len(true)), focal_length=485.0, marker_size=SIZE, noise=noise)
     assert len(true) >= 3
     ratio = errors.var(axis=0) / said
     # By hand, of a marker of width w and height h: (1 + (w / h)^2) / 1.5 in the bearing.
@@ -115,10 +114,23 @@ def test_corner_noise_gives_the_variances_that_are_promised() -> None:
 
 def test_means_over_pictures_lose_the_white_noise_only() -> None:
     values = np.array([[0.1, math.log(1.5)]])
-    terms = {"focal_length": 485.0, "marker_size": SIZE, "noise": np.array([0.5, 0.001, 0.003])}
-    one, many = (variances(values, np.array([float(n)]), **terms)[0] for n in (1, 100))
+    noise = np.array([0.5, 0.0, 0.001, 0.003])
+    terms = {"focal_length": 485.0, "marker_size": SIZE}
+    one, many = (variances(values, np.array([float(n)]), **terms, noise=noise)[0] for n in (1, 100))
     floor = np.square([0.001, 0.003])
     np.testing.assert_allclose((one - floor) / (many - floor), 100.0)
+    # What of it no mean takes away is as large as noise that nobody has taken means of.
+    lasting = variances(values, np.array([1e9]), **terms, noise=np.array([0.5, 0.2, 0.001, 0.003]))
+    np.testing.assert_allclose((lasting[0] - floor) / (one - floor), (0.2 / 0.5) ** 2, rtol=1e-6)
+
+
+def test_what_lasts_of_corners_makes_far_distances_doubtful() -> None:
+    """0.1 px of 485 px x 0.16 m at 1 and at 4 m, by hand; of the bearing it is the same."""
+    values = np.array([[0.0, 0.0], [0.0, math.log(4.0)]])
+    terms = {"focal_length": 485.0, "marker_size": SIZE, "noise": np.array([0, 0.1, 0, 0])}
+    bearing, distance = np.sqrt(variances(values, np.ones(2), **terms)).T
+    np.testing.assert_allclose(distance, 0.1 / (485.0 * SIZE) * np.array([1.0, 4.0]))
+    np.testing.assert_allclose(bearing, 0.1 * math.sqrt(1.5) / 2 / 485.0)
 
 
 def test_distances_of_small_markers_are_right_in_the_mean() -> None:
