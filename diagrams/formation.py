@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pydrake.geometry import Meshcat
 
 from diagrams.formation_checks import check_sight, check_sizes
+from diagrams.formation_errors import PRESETS, FormationErrors, misplaced
 from diagrams.formation_faults import COMMAND, FailAs, RobotFault, check_faults, faults_of
 from diagrams.formation_mission import FormationMission
 from diagrams.formation_sensing import ring_of
@@ -83,6 +84,9 @@ class FormationScenario(Scenario):
         fail_as: what it is from then on: a `beacon` still, which only cannot move, or a `wreck`,
             which neither sees nor is seen.
         faults: what goes wrong with signals and motors for a time, by the number of the robot.
+        errors: what is wrong with the robots all the time: `none`, `base` or `harsh`, or standard
+            deviations of your own. Estimator and controller are told of them where they are not
+            told otherwise.
     """
 
     random_world: ClassVar[RandomWorld] = CLUTTER
@@ -105,6 +109,7 @@ class FormationScenario(Scenario):
     fail_at: float = 0.0
     fail_as: FailAs = "beacon"
     faults: list[RobotFault] = field(default_factory=list)
+    errors: Literal["none", "base", "harsh"] | FormationErrors = "none"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -156,6 +161,17 @@ class FormationScenario(Scenario):
         check_free(self.world.arena, self.destination, room, "destination")
         check_sight(self)
         check_sizes(self)
+        self._tell()
+
+    def _tell(self) -> None:
+        """Tells estimator and controller how large the errors are.
+
+        Now, so that the scenario that is saved says what they know.
+        """
+        errors = self.deviations()
+        if self.estimator is not None:
+            self.estimator = self.estimator.told(errors.for_estimator(self.formation.side))
+        self.controller = self.controller.told(errors.for_controller(), "noise")
 
     def places(self) -> Array:
         """Returns where the robots stand at the start, (N, 2) m."""
@@ -180,15 +196,21 @@ class FormationScenario(Scenario):
         """Returns the names of the robots."""
         return [f"robot{k + 1}" for k in range(self.robots)]
 
+    def deviations(self) -> FormationErrors:
+        """Returns how large the errors of the robots are."""
+        return PRESETS[self.errors] if isinstance(self.errors, str) else self.errors
+
     def station_robots(self) -> dict[str, RobotParameters]:
-        """Returns the robots by name."""
-        hardware, robots = vars(self.robot), {}
+        """Returns the robots by name, with what is wrong with them."""
+        errors, robots = self.deviations(), {}
         for k, (name, (x, y)) in enumerate(zip(self.names(), self.places(), strict=True), 1):
-            faults = [fault for fault in faults_of(self, k) if fault.signal != COMMAND]
             start = Start(x=float(x), y=float(y), heading_deg=self.heading_deg)
-            robots[name] = RobotParameters(
-                **hardware | {"faults": [*self.robot.faults, *faults]}, start=start
+            robot, start = misplaced(
+                self.robot, start, self.cameras(), errors=errors, seed=self.seed, name=name
             )
+            faults = [fault for fault in faults_of(self, k) if fault.signal != COMMAND]
+            own = vars(robot) | {"faults": [*robot.faults, *faults]}
+            robots[name] = RobotParameters(**own, start=start)
         return robots
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:

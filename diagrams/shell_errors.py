@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
-from systems.estimators.shell_ekf_parameters import ShellEkfParameters
 from systems.validation import require, require_non_negative
 
 # A deviation of what lies evenly within +-1.
@@ -86,8 +84,3 @@ PRESETS = {
         outliers=0.03,
     ),
 }
-
-
-def told(parameters: ShellEkfParameters, errors: ShellErrors) -> dict[str, Any]:
-    """Returns the deviations of a filter that are too small for errors of these bounds."""
-    return {k: v for k, v in errors.priors().items() if v > getattr(parameters, k)}

@@ -17,8 +17,7 @@ from pydrake.geometry import Meshcat
 from diagrams.drivers.shell_body import ShellStart
 from diagrams.mission import Mission
 from diagrams.scenario import Scenario
-from diagrams.schema import ScenarioError
-from diagrams.shell_errors import PRESETS, ShellErrors, told
+from diagrams.shell_errors import PRESETS, ShellErrors
 from diagrams.shell_mission import ShellMission
 from diagrams.shell_world import REFERENCE, ShellWorldParameters
 from diagrams.station import Hardware, RobotParameters
@@ -153,10 +152,10 @@ class SnailBotScenario(Scenario):
             force is None or 0 <= force < math.inf, "magnet_force", force, "0 or greater, finite"
         )
         body = self.robot.body
-        require(_has(body.target, "carries_shell"), "robot.body", body.type, "one that climbs")
+        require(body.has("carries_shell"), "robot.body", body.type, "one that climbs")
         for key, method in (("camera", "planned_view"), ("imu", "position")):
             name = getattr(self, key)
-            fit = [n for n, s in self.robot.sensors.items() if _has(s.target, method)]
+            fit = [n for n, s in self.robot.sensors.items() if s.has(method)]
             have = ", ".join(fit) or "none"
             require(name in fit, key, name, f"one of the robot's sensors that fit: {have}")
         imu, camera = (self.robot.sensors[name].build() for name in (self.imu, self.camera))
@@ -225,24 +224,22 @@ class SnailBotScenario(Scenario):
         if carries_shell:
             changes["carries_shell"] = True
             changes["rocking"] = replace(built.rocking, bound=0.0)
-        robot = replace(self.robot, body=_changed(body, **changes))
+        robot = replace(self.robot, body=body.changed(**changes))
         camera, imu = (robot.sensors[name] for name in (self.camera, self.imu))
-        camera = _changed(camera, imu=self.imu)
+        camera = camera.changed(imu=self.imu)
         if errors is None:
             return replace(robot, sensors=robot.sensors | {self.camera: camera})
         latency = camera.build().latency
         bias = math.radians(errors.gyro_bias_deg_s)
         sensors = robot.sensors | {
-            self.camera: _changed(
-                camera,
+            self.camera: camera.changed(
                 mounting_tolerance_deg=errors.mounting_deg,
                 height_tolerance=errors.flow_scale,
                 clock_error=errors.delay,
                 latency=max(latency, errors.delay),
                 missed_passages=errors.missed_passages,
             ),
-            self.imu: _changed(
-                imu,
+            self.imu: imu.changed(
                 parameters=replace(
                     imu.build().parameters,
                     gyro_bias=[0.0] * 3,
@@ -258,13 +255,7 @@ class SnailBotScenario(Scenario):
         parameters = choice.arguments.get("parameters")
         if errors is None or not isinstance(parameters, ShellEkfParameters):
             return choice
-        place = choice.place
-        wider = {
-            name: deviation
-            for name, deviation in told(parameters, errors).items()
-            if (*place.key, name) not in place.origins
-        }
-        return _changed(choice, parameters=replace(parameters, **wider))
+        return choice.told(errors.priors())
 
     def build(self, *, meshcat: Meshcat | None = None, out: Path | None = None) -> Mission:
         """Wires station, estimators and steering.
@@ -284,20 +275,3 @@ def closes(legs: list[Leg]) -> bool:
     """Whether a route ends at the place where it begins."""
     end = legs[-1].frame() @ rotation_from_vector(np.array([0.0, legs[-1].arc, 0.0]))
     return bool(np.linalg.norm(end[:, 2] - legs[0].frame()[:, 2]) < _SAME_PLACE)
-
-
-def _has(target: Any, name: str) -> bool:
-    fields = getattr(target, "__dataclass_fields__", {})
-    return hasattr(target, name) or name in fields
-
-
-def _changed(choice: Choice, **arguments: Any) -> Choice:
-    """Returns a block of which some arguments are others.
-
-    Raises:
-        ScenarioError: it has no such argument.
-    """
-    for name in arguments:
-        if not _has(choice.target, name) and name != "parameters":
-            raise ScenarioError(f"{choice.place}: {choice.type} has no {name}")
-    return replace(choice, arguments=choice.arguments | arguments)

@@ -19,6 +19,7 @@ import dataclasses
 import importlib
 import importlib.machinery
 import inspect
+import math
 import sys
 import typing
 from collections.abc import Iterable, Iterator, Mapping
@@ -79,6 +80,43 @@ class Choice:
             raise self.place.error(
                 f"{self.place}: {self.target.__name__} raises {type(error).__name__}: {error}"
             ) from error
+
+    def has(self, name: str) -> bool:
+        """Whether the class has a field, or anything else, of that name."""
+        fields = getattr(self.target, "__dataclass_fields__", {})
+        return hasattr(self.target, name) or name in fields
+
+    def changed(self, **arguments: Any) -> Choice:
+        """Returns the block with some arguments others than they are.
+
+        Raises:
+            ScenarioError: it has no such argument.
+        """
+        for name in arguments:
+            if not self.has(name) and name not in _constructor_hints(self.target):
+                raise ScenarioError(f"{self.place}: {self.type} has no {name}")
+        return dataclasses.replace(self, arguments=self.arguments | arguments)
+
+    def told(self, deviations: Mapping[str, float], argument: str = "parameters") -> Choice:
+        """Returns the block, expecting errors at least so large where it is not told otherwise.
+
+        Args:
+            deviations: by name; those that the block has not got, and those that the scenario
+                gives, are left as they are.
+            argument: the dataclass among its arguments that has them.
+        """
+        kind = _dataclass_of(_constructor_hints(self.target).get(argument))
+        if kind is None:
+            return self
+        expected = self.arguments.get(argument) or kind()
+        key = self.place.key if argument == "parameters" else (*self.place.key, argument)
+        wider = {
+            name: deviation
+            for name, deviation in deviations.items()
+            if deviation > getattr(expected, name, math.inf)
+            and (*key, name) not in self.place.origins
+        }
+        return self.changed(**{argument: dataclasses.replace(expected, **wider)}) if wider else self
 
     def to_plain(self) -> Any:
         """Returns the block as plain data, defaults filled in."""

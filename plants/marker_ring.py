@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
+import numpy as np
 from pydrake.geometry import FrameId
 from pydrake.math import RigidTransform, RotationMatrix
 from pydrake.multibody.plant import MultibodyPlant
@@ -13,7 +14,7 @@ from pydrake.multibody.tree import RigidBody
 from plants.boards import add_board
 from systems.markers.family import Family
 from systems.markers.projector import PlacedMarker
-from systems.validation import require_positive
+from systems.validation import require, require_positive
 
 SIDES = ("front", "left", "back", "right")
 
@@ -26,21 +27,35 @@ class MarkerRing:
         size: side of the black square, m.
         distance: of their centres from the robot's vertical axis, m.
         height: of their centres over the ground, m.
+        misplaced: [outward (m), to the left (m), larger by this part] for each of the four: how far
+            each is off all this; left out, not at all.
     """
 
     size: float = 0.16
     distance: float = 0.15
     height: float = 0.20
+    misplaced: list[list[float]] = field(default_factory=lambda: [[0.0] * 3] * len(SIDES))
 
     def __post_init__(self) -> None:
-        require_positive(**vars(self))
+        require_positive(size=self.size, distance=self.distance, height=self.height)
+        off = self.misplaced
+        sound = len(off) == len(SIDES) and all(len(row) == 3 for row in off)
+        require(
+            sound and bool(np.isfinite(off).all()) and min(row[2] for row in off) > -1,
+            "misplaced",
+            off,
+            f"[outward, left, larger] for each of {', '.join(SIDES)}; larger by more than -1",
+        )
 
-    def poses(self) -> list[RigidTransform]:
-        """Returns `X_BM` of the four markers."""
+    def markers(self) -> list[tuple[RigidTransform, float]]:
+        """Returns where the four markers truly are, `X_BM`, and how large, m."""
         return [
-            RigidTransform(RotationMatrix.MakeZRotation(k * math.pi / 2))
-            @ RigidTransform([self.distance, 0.0, self.height])
-            for k in range(len(SIDES))
+            (
+                RigidTransform(RotationMatrix.MakeZRotation(k * math.pi / 2))
+                @ RigidTransform([self.distance + outward, left, self.height]),
+                self.size * (1 + larger),
+            )
+            for k, (outward, left, larger) in enumerate(self.misplaced)
         ]
 
 
@@ -61,7 +76,7 @@ def add_marker_ring(
     """
     frame: FrameId = plant.GetBodyFrameIdOrThrow(body.index())
     placed = []
-    for k, X_BM in enumerate(ring.poses()):
-        add_board(plant, body, X_BM, family=family, marker_id=first_id + k, size=ring.size)
-        placed.append(PlacedMarker(first_id + k, ring.size, frame, X_BM))
+    for k, (X_BM, size) in enumerate(ring.markers()):
+        add_board(plant, body, X_BM, family=family, marker_id=first_id + k, size=size)
+        placed.append(PlacedMarker(first_id + k, size, frame, X_BM))
     return placed

@@ -253,10 +253,12 @@ class Camera(CameraDriver):
     Attributes:
         position: [x, y, z] of the optical centre in base_link, m.
         rpy_deg: roll, pitch, yaw of the camera; zeros look forward, positive pitch looks down.
+        yaw_error_deg: how far to the left of that it truly looks, though nobody knows.
     """
 
     position: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.1])
     rpy_deg: list[float] = field(default_factory=lambda: [0.0, 0.0, 0.0])
+    yaw_error_deg: float = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -265,11 +267,19 @@ class Camera(CameraDriver):
             require(
                 len(value) == 3 and bool(np.isfinite(value).all()), name, value, "three numbers"
             )
+        aside = self.yaw_error_deg
+        require(math.isfinite(aside), "yaw_error_deg", aside, "finite")
 
     def mounting(self) -> RigidTransform:
-        """Returns `X_BC`, the pose of the optical frame in base_link."""
+        """Returns `X_BC`, the pose of the optical frame in base_link as the robot believes it."""
         R_BMount = RollPitchYaw(*(math.radians(a) for a in self.rpy_deg)).ToRotationMatrix()
         return RigidTransform(R_BMount.multiply(R_FORWARD_OPTICAL), self.position)
+
+    def true_mounting(self) -> RigidTransform:
+        """Returns `X_BC` with its error."""
+        X_BC = self.mounting()
+        aside = RotationMatrix.MakeZRotation(math.radians(self.yaw_error_deg))
+        return RigidTransform(aside @ X_BC.rotation(), X_BC.translation())
 
     def planned_mounting(self, robot: Robot) -> RigidTransform:
         """Returns `X_BC`."""
@@ -281,7 +291,7 @@ class Camera(CameraDriver):
         world = station.scene_graph.world_frame_id()
         others = [m for name, m in station.carried_markers.items() if name != robot.name]
         return View(
-            X_BC=self.mounting(),
+            X_BC=self.true_mounting(),
             markers=[*placed_markers(station.true_markers, world), *chain(*others)],
             own_frames=[robot.frame_id],
         )

@@ -37,11 +37,13 @@ class Kind:
         name: in the table.
         overrides: of the scenario.
         asked: whether it is to reach anything: never broken, and at most 0.10 m off.
+        consistent: whether it has the errors that it allows for, and is to be as wrong as it says.
     """
 
     name: str
     overrides: tuple[str, ...]
     asked: bool
+    consistent: bool = False
 
 
 TWIN = Kind("ours, kinematic twin", (*BASE, "dynamics=kinematic"), True)
@@ -52,6 +54,7 @@ TOLD = Kind(
     (
         *BASE,
         "dynamics=kinematic",
+        "estimator.corner_floor=0",
         "estimator.bearing_floor=1e-5",
         "estimator.range_floor=1e-4",
         "estimator.yaw_error=1e-5",
@@ -59,6 +62,12 @@ TOLD = Kind(
         "estimator.start_heading_noise=1e-4",
     ),
     False,
+)
+ERRORS = Kind(
+    "ours, robots with the base errors, twin",
+    (*BASE, "dynamics=kinematic", "errors=base"),
+    False,
+    consistent=True,
 )
 PAPER = Kind(
     "the paper's way with its errors, twin",
@@ -98,7 +107,9 @@ def rows(kind: Kind, records: list[dict[str, Any]]) -> Iterator[Row]:
     yield Row(f"{what}: side, largest error", f"{1e3 * sides:.1f} mm")
     each = [metrics["nees_mean"] for metrics in reached if metrics["nees_mean"] is not None]
     if each:
-        yield Row(f"{what}: NEES per dimension", f"{np.mean(each):.2f}")
+        nees, asked = float(np.mean(each)), kind.consistent
+        yield Row(f"{what}: NEES per dimension", f"{nees:.2f}", "0.8 to 1.25" if asked else "",
+                  0.8 <= nees <= 1.25 if asked else None)  # fmt: skip
     factor = np.median([r["sim_seconds"] / r["wall_seconds"] for r in records if "metrics" in r])
     yield Row(f"{what}: real-time factor, median", f"{factor:.1f}")
 
@@ -115,6 +126,7 @@ def main() -> bool:
     parser.add_argument("--runs", type=int, default=100, help="of ours on the twin (100)")
     parser.add_argument("--plant-runs", type=int, default=5, help="of ours in the plant (5)")
     parser.add_argument("--told-runs", type=int, default=10, help="of an estimator that knows (10)")
+    parser.add_argument("--error-runs", type=int, default=20, help="with the base errors (20)")
     parser.add_argument("--paper-runs", type=int, default=20, help="of the paper's way (20)")
     parser.add_argument("--workers", type=int, help="processes (one for each core)")
     parser.add_argument("--out", type=Path, help="folder that keeps what is done")
@@ -125,6 +137,7 @@ def main() -> bool:
             (TWIN, options.runs, "twin"),
             (PLANT, options.plant_runs, "plant"),
             (TOLD, options.told_runs, "told"),
+            (ERRORS, options.error_runs, "errors"),
             (PAPER, options.paper_runs, "paper"),
         )
         found = (
