@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from pydrake.systems.analysis import Simulator
+from pydrake.systems.framework import Context
 
 from diagrams.schema import Place, convert
 from diagrams.station import RobotParameters, Station
@@ -64,20 +65,27 @@ def robot(x: float, y: float, heading: float) -> RobotParameters:
     return parameters
 
 
-@pytest.fixture(scope="module", params=["projected", "rendered"])
-def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """What three robots see of each other: b and c stand before a, c turned by 90 degrees."""
+def looked(robots: dict[str, RobotParameters], sight: str) -> tuple[Station, Context]:
+    """Robots that stand and look, after two pictures."""
     station = Station(
         world=WorldParameters(markers=TagList("36h11", 0.16, [])),
-        robots={"a": robot(0, 0, 0), "b": robot(2, 0, 180), "c": robot(2, 1.0, 90)},
-        sight=request.param,
+        robots=robots,
+        sight=sight,
         time_step=0.01,
     )
     simulator = Simulator(station)
     context = simulator.get_mutable_context()
-    for name in "abc":
+    for name in robots:
         station.GetInputPort(f"{name}.drive.command").FixValue(context, [0.0, 0.0])
     simulator.AdvanceTo(0.2)
+    return station, context
+
+
+@pytest.fixture(scope="module", params=["projected", "rendered"])
+def seen(request: pytest.FixtureRequest) -> dict[str, Any]:
+    """What three robots see of each other: b and c stand before a, c turned by 90 degrees."""
+    robots = {"a": robot(0, 0, 0), "b": robot(2, 0, 180), "c": robot(2, 1.0, 90)}
+    station, context = looked(robots, request.param)
     return {n: station.GetOutputPort(f"{n}.camera.detections").Eval(context) for n in "abc"}
 
 
@@ -100,17 +108,8 @@ def test_a_camera_that_looks_aside_sees_all_on_the_other_side() -> None:
     for aside in (0.0, 2.0):
         looks = robot(0, 0, 0)
         camera = looks.sensors["camera"].changed(yaw_error_deg=aside)
-        station = Station(
-            world=WorldParameters(markers=TagList("36h11", 0.16, [])),
-            robots={"a": replace(looks, sensors={"camera": camera}), "b": robot(2, 0, 180)},
-            sight="projected",
-            time_step=0.01,
-        )
-        simulator = Simulator(station)
-        context = simulator.get_mutable_context()
-        for name in "ab":
-            station.GetInputPort(f"{name}.drive.command").FixValue(context, [0.0, 0.0])
-        simulator.AdvanceTo(0.2)
+        robots = {"a": replace(looks, sensors={"camera": camera}), "b": robot(2, 0, 180)}
+        station, context = looked(robots, "projected")
         found = station.GetOutputPort("a.camera.detections").Eval(context)
         centres.append(found.corners[list(found.ids).index(4)].mean(axis=0))
         _, mounted = station.static_messages["/tf_static"]
