@@ -165,7 +165,9 @@ def test_parameters_that_must_be_above_zero(field: str) -> None:
         FormationFilterParameters(**{field: 0.0})
 
 
-@pytest.mark.parametrize("field", ["marker_offset", "pixel_noise", "corner_floor", "yaw_error"])
+@pytest.mark.parametrize(
+    "field", ["marker_offset", "pixel_noise", "corner_floor", "yaw_error", "settle_time"]
+)
 def test_parameters_that_may_be_zero(field: str) -> None:
     FormationFilterParameters(**{field: 0.0})
     with pytest.raises(ValueError, match=f"{field} is -1.0: must be 0 or greater"):
