@@ -14,7 +14,8 @@ from diagrams.scenario import load_scenario
 from systems.formation.triangles import next_vertex
 from systems.planners.formation_lattice import strip
 
-PROJECTED = {"sight": "projected", "record.bag": False}
+# What robots with errors do is in `test_formation_errors`.
+PROJECTED = {"sight": "projected", "record.bag": False, "errors": "none"}
 
 
 @pytest.fixture(scope="module")
