@@ -46,7 +46,7 @@ class Kind:
     consistent: bool = False
 
 
-TWIN = Kind("ours, kinematic twin", (*BASE, "dynamics=kinematic"), True)
+TWIN = Kind("ours, kinematic twin", (*BASE, "dynamics=kinematic"), True, consistent=True)
 PLANT = Kind("ours, plant", BASE, True)
 EXACT = Kind("... robots as they are said to be", (*TWIN.overrides, "errors=none"), True)
 # What no mean takes away, and what is not known at the start, are not in that simulation.
@@ -62,14 +62,6 @@ TOLD = Kind(
         "estimator.start_heading_noise=1e-4",
     ),
     False,
-)
-# The estimator takes a marker's error for a new one after each move, but it stays the same: over
-# 40 moves it is a little surer than it should be.
-TEN = Kind(
-    "ours, the bundled ten moves, twin",
-    ("sight=projected", "dynamics=kinematic"),
-    False,
-    consistent=True,
 )
 PAPER = Kind(
     "the paper's way with its errors, twin",
@@ -129,7 +121,6 @@ def main() -> bool:
     parser.add_argument("--plant-runs", type=int, default=5, help="of ours in the plant (5)")
     parser.add_argument("--exact-runs", type=int, default=20, help="of robots without errors (20)")
     parser.add_argument("--told-runs", type=int, default=10, help="... and who knows it (10)")
-    parser.add_argument("--ten-runs", type=int, default=40, help="of ten moves (40)")
     parser.add_argument("--paper-runs", type=int, default=20, help="of the paper's way (20)")
     parser.add_argument("--workers", type=int, help="processes (one for each core)")
     parser.add_argument("--out", type=Path, help="folder that keeps what is done")
@@ -141,7 +132,6 @@ def main() -> bool:
             (PLANT, options.plant_runs, "plant"),
             (EXACT, options.exact_runs, "exact"),
             (TOLD, options.told_runs, "told"),
-            (TEN, options.ten_runs, "ten"),
             (PAPER, options.paper_runs, "paper"),
         )
         found = (
